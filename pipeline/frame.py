@@ -1,0 +1,240 @@
+"""From raw pixels and a State to a Frame: masks, background, noise, and the image classifier."""
+
+from dataclasses import dataclass, replace
+from enum import StrEnum
+
+import numpy as np
+from pydantic import Field
+
+from pipeline.errors import ImageError
+from pipeline.imaging.background import Background, BackgroundOptions, estimate_background, estimate_gain
+from pipeline.imaging.masks import missing_pixels, saturated_pixels
+from pipeline.imaging.psf import PointSpread
+from pipeline.options import Options
+from pipeline.records import BoolArray, CameraModel, Detector, FloatArray, Image, State
+from pipeline.status import StatusReason
+
+# An ideal quantiser adds a twelfth of its step squared to the variance.
+_QUANTISATION_SIGMA = 1.0 / np.sqrt(12.0)
+
+
+class FrameOptions(Options):
+    """Limits of the image classifier and the noise model's defaults."""
+
+    background: BackgroundOptions = BackgroundOptions()
+    max_missing_share: float = Field(0.6, gt=0, le=1, description="share of missing pixels beyond which a frame is left")
+    max_saturated_share: float = Field(0.5, gt=0, le=1, description="share of full pixels beyond which a frame is left")
+    noisy_factor: float = Field(4.0, gt=1, description="noise over the expected noise that marks a frame as noisy")
+    gradient_sigma: float = Field(10.0, gt=0, description="range of the background over the noise that marks a gradient")
+    default_psf_sigma_px: float = Field(0.8, gt=0.2, le=10, description="PSF core where neither camera nor label says")
+    default_psf_misfit: float = Field(
+        0.15, gt=0, le=1, description="share of a star's light off the Gaussian, where the camera does not say"
+    )
+    max_trail_px: float = Field(30.0, ge=0, le=200, description="longest smear that is modelled, pixels")
+
+
+class ImageClass(StrEnum):
+    """What kind of image this is, before anything is looked for in it."""
+
+    NORMAL = "normal"
+    NOISY = "noisy"
+    GRADIENT = "gradient"
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """An image ready for measurement.
+
+    Attributes
+    ----------
+    pixels
+        (rows, cols) float32 DN, background subtracted; zero where bad.
+    sigma
+        (rows, cols) background noise, DN.
+    bad
+        (rows, cols) True where no measurement exists (missing, flagged or saturated).
+    saturated
+        (rows, cols) True where the response ended.
+    gain_e_per_dn
+        From the camera or estimated; None when unknown.
+    spread
+        Shape of a point source, with the smear that the attitude's rate predicts.
+    image_class
+        Kind of image.
+    background_dn, noise_dn, missing_share, saturated_share
+        Figures for the record.
+    """
+
+    pixels: Image
+    sigma: Image
+    bad: BoolArray
+    saturated: BoolArray
+    gain_e_per_dn: float | None
+    spread: PointSpread
+    image_class: ImageClass
+    background_dn: float
+    noise_dn: float
+    missing_share: float
+    saturated_share: float
+
+
+def make_frame(pixels: Image, flagged: BoolArray | None, state: State, options: FrameOptions) -> Frame:
+    """Mask, level and classify one image.
+
+    Parameters
+    ----------
+    pixels
+        (rows, cols) DN as read, any real type.
+    flagged
+        (rows, cols) True where the product itself marks a pixel as bad, or None.
+    state
+        Camera, detector and attitude.
+    options
+        Limits.
+
+    Returns
+    -------
+    Frame
+        Ready for measurement.
+
+    Raises
+    ------
+    ImageError
+        If the array does not fit the camera, or is blank, full, mostly missing or not finite.
+    """
+    _check_shape(pixels, state.camera_model)
+    integral = pixels.dtype.kind in "iub"
+    image = np.ascontiguousarray(pixels, dtype=np.float32)
+    detector = state.detector
+    finite = np.isfinite(image)
+    if not finite.any():
+        raise ImageError(StatusReason.IMAGE_NOT_FINITE, "no pixel is a finite number")
+    image = np.where(finite, image, np.float32(0.0))
+    saturated = saturated_pixels(image, _saturation(detector, pixels), detector.read_noise_dn) & finite
+    floor = float(np.hypot(detector.read_noise_dn or 0.0, _QUANTISATION_SIGMA if integral else 0.0))
+    rough = _rough_level(image[finite & ~saturated]) if (finite & ~saturated).any() else (0.0, 0.0)
+    missing = missing_pixels(image, detector.missing_value, rough[0], max(rough[1], floor)) | ~finite
+    _refuse_hopeless(image, missing, saturated, options)
+    bad = missing | saturated if flagged is None else missing | saturated | flagged
+    background, gain = _level(image, bad, detector, floor, options)
+    image -= background.level
+    image[bad & ~saturated] = 0.0
+    noise = float(np.median(background.tile_sigma))
+    return Frame(
+        pixels=image, sigma=background.sigma, bad=bad, saturated=saturated, gain_e_per_dn=gain,
+        spread=point_spread(state, options), image_class=_classify(background, detector, noise, floor, options),
+        background_dn=float(np.median(background.tile_level)), noise_dn=noise,
+        missing_share=float(missing.mean()), saturated_share=float(saturated.mean()),
+    )  # fmt: skip
+
+
+def _check_shape(pixels: Image, camera: CameraModel) -> None:
+    if pixels.ndim != 2 or pixels.shape != tuple(camera.shape_vu):
+        got = "x".join(map(str, pixels.shape))
+        want = "x".join(map(str, camera.shape_vu))
+        raise ImageError(StatusReason.IMAGE_SHAPE_MISMATCH, f"the image is {got}, the camera's array {want}")
+
+
+def _saturation(detector: Detector, pixels: Image) -> float | None:
+    """Declared saturation, else the end of an 8-bit range, where real images do saturate."""
+    if detector.saturation_dn is None and pixels.dtype.kind == "u" and pixels.dtype.itemsize == 1:
+        return float(np.iinfo(pixels.dtype).max)
+    return detector.saturation_dn
+
+
+def _rough_level(values: Image) -> tuple[float, float]:
+    """Median and half the central 68 % of a sample, without regard to where in the image."""
+    sample = values[:: max(1, values.size // 20000)]
+    low, middle, high = np.quantile(sample, (0.158655, 0.5, 0.841345))
+    return float(middle), float(high - low) / 2
+
+
+def _refuse_hopeless(image: Image, missing: BoolArray, saturated: BoolArray, options: FrameOptions) -> None:
+    missing_share, full_share = float(missing.mean()), float(saturated.mean())
+    if full_share > options.max_saturated_share:
+        raise ImageError(StatusReason.IMAGE_OVEREXPOSED, f"{full_share:.0%} of the pixels are saturated")
+    if missing_share < 1.0 and np.ptp(image[~missing]) == 0.0:
+        raise ImageError(StatusReason.IMAGE_BLANK, f"every pixel is {image[~missing][0]:g} DN")
+    if missing_share == 1.0 and np.ptp(image) == 0.0:
+        raise ImageError(StatusReason.IMAGE_BLANK, f"every pixel is the fill value {image.flat[0]:g}")
+    if missing_share > options.max_missing_share:
+        raise ImageError(StatusReason.IMAGE_MOSTLY_MISSING, f"{missing_share:.0%} of the pixels are missing")
+
+
+def _level(
+    image: Image, bad: BoolArray, detector: Detector, floor: float, options: FrameOptions
+) -> tuple[Background, float | None]:
+    """Background with the camera's gain, or with the one that the image itself shows."""
+    biased = image if detector.bias_dn == 0.0 else image - np.float32(detector.bias_dn)
+    background = estimate_background(biased, bad, floor, detector.gain_e_per_dn, options.background)
+    gain = detector.gain_e_per_dn
+    if gain is None and detector.read_noise_dn is not None:
+        gain = estimate_gain(background, detector.read_noise_dn)
+    if detector.bias_dn:
+        bias = np.float32(detector.bias_dn)
+        background = replace(background, level=background.level + bias, tile_level=background.tile_level + bias)
+    return background, gain
+
+
+def _classify(
+    background: Background, detector: Detector, noise: float, floor: float, options: FrameOptions
+) -> ImageClass:
+    expected = floor
+    if detector.gain_e_per_dn:
+        above_bias = float(np.median(background.tile_level)) - detector.bias_dn
+        expected = float(np.hypot(floor, np.sqrt(max(above_bias, 0.0) / detector.gain_e_per_dn)))
+    if expected > 0 and noise > options.noisy_factor * expected:
+        return ImageClass.NOISY
+    if np.ptp(background.tile_level) > options.gradient_sigma * max(noise, 1e-6):
+        return ImageClass.GRADIENT
+    return ImageClass.NORMAL
+
+
+def point_spread(state: State, options: FrameOptions) -> PointSpread:
+    """Point source of this camera during this exposure.
+
+    Parameters
+    ----------
+    state
+        Detector's PSF and the attitude's rate.
+    options
+        Default PSF and longest trail.
+
+    Returns
+    -------
+    PointSpread
+        With the trail that a star leaves at the array centre.
+    """
+    sigma = state.detector.psf_sigma_px or options.default_psf_sigma_px
+    trail = smear_trail(state)
+    length = float(np.hypot(*trail))
+    if length > options.max_trail_px:
+        trail = trail * (options.max_trail_px / length)
+    # A hundredth of the core's width cannot be told from none, and none is faster.
+    if length < 0.1 * sigma:
+        trail = np.zeros(2)
+    return PointSpread(sigma, (float(trail[0]), float(trail[1])), state.detector.psf_misfit or options.default_psf_misfit)
+
+
+def smear_trail(state: State) -> FloatArray:
+    """Vector along which a star moves over the array during the exposure.
+
+    A camera that turns at rate w (its own axes) sees a fixed direction s move as -w x s.
+
+    Parameters
+    ----------
+    state
+        Rate and exposure; unknown ones count as zero.
+
+    Returns
+    -------
+    numpy.ndarray
+        (2,) pixels along (v, u), at the boresight.
+    """
+    rate = state.attitude.rate_rad_s
+    if rate is None or not state.exposure_s:
+        return np.zeros(2)
+    camera = state.camera_model
+    motion_xy = -np.cross(rate, [0.0, 0.0, 1.0])[:2] * state.exposure_s
+    uv = camera.k_px_per_mm @ (camera.focal_length_mm * motion_xy)
+    return np.asarray(uv[::-1])

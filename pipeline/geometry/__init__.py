@@ -1,0 +1,1 @@
+"""Rotations, pointing corrections, astrometry and (for bodies and rings) shapes."""

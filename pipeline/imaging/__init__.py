@@ -1,0 +1,1 @@
+"""Pixels: background and noise, masks, point sources."""

@@ -1,0 +1,83 @@
+"""Which pixels carry no measurement: not finite, never received, saturated."""
+
+import cv2
+import numpy as np
+
+from pipeline.records import BoolArray, Image
+
+# The chance that noise alone makes one run of clipped pixels somewhere in the image is kept below this.
+_CHANCE_RUN = 1e-3
+# A level this many sigmas from the fill value leaves no room for noise to reach it.
+_CLEAR_OF_FILL_SIGMA = 5.0
+_SATURATION_NOISE_SIGMA = 4.0
+
+
+def missing_pixels(image: Image, missing_value: float | None, level_dn: float, sigma_dn: float) -> BoolArray:
+    """Pixels that were never received, told from pixels that noise has clipped to the same value.
+
+    Where the background is far from the fill value every pixel with that value is missing. Where noise can reach
+    it, only rows' runs too long for chance are.
+
+    Parameters
+    ----------
+    image
+        (rows, cols) DN; not-a-number counts as missing.
+    missing_value
+        Fill value, None when there is none.
+    level_dn, sigma_dn
+        Background and its noise.
+
+    Returns
+    -------
+    numpy.ndarray
+        (rows, cols) True where missing.
+    """
+    missing = ~np.isfinite(image)
+    if missing_value is None:
+        return missing
+    equal = image == np.float32(missing_value)
+    share = float(equal.mean())
+    if share == 0.0:
+        return missing
+    if abs(level_dn - missing_value) > _CLEAR_OF_FILL_SIGMA * max(sigma_dn, 1e-6):
+        return missing | equal
+    return missing | _long_runs(equal, _run_length(equal))
+
+
+def _run_length(equal: BoolArray) -> int:
+    """Shortest run along a row that chance would not make, from the share of clipped pixels in a typical row."""
+    share = float(np.clip(np.median(equal.mean(axis=1)), 0.01, 0.9))
+    return int(np.ceil(np.log(_CHANCE_RUN / equal.size) / np.log(share)))
+
+
+def _long_runs(flags: BoolArray, length: int) -> BoolArray:
+    """Runs of at least ``length`` along rows: a morphological opening with a horizontal bar."""
+    if length > flags.shape[1]:
+        return np.zeros_like(flags)
+    bar = np.ones((1, length), np.uint8)
+    return cv2.morphologyEx(flags.astype(np.uint8), cv2.MORPH_OPEN, bar, borderValue=0).astype(bool)
+
+
+def saturated_pixels(image: Image, saturation_dn: float | None, read_noise_dn: float | None) -> BoolArray:
+    """Pixels whose well or converter is full.
+
+    Parameters
+    ----------
+    image
+        (rows, cols) DN.
+    saturation_dn
+        Level at which the response ends, None when unknown.
+    read_noise_dn
+        Noise that may have been added after clipping.
+
+    Returns
+    -------
+    numpy.ndarray
+        (rows, cols) True where saturated.
+    """
+    if saturation_dn is None:
+        return np.zeros(image.shape, bool)
+    slack = _SATURATION_NOISE_SIGMA * (read_noise_dn or 0.0)
+    # At most a tenth of the range: a noisy camera must not lose its upper half.
+    result: BoolArray = image >= saturation_dn - min(slack, 0.1 * abs(saturation_dn))
+    return result

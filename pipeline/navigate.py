@@ -1,0 +1,211 @@
+"""One image from start to end."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from pydantic import Field
+
+from pipeline.ensemble import EnsembleOptions, _CombinedEstimate, ensemble
+from pipeline.errors import ImageFailure
+from pipeline.frame import Frame, FrameOptions, make_frame
+from pipeline.imaging.detect import DetectionOptions, detect_point_sources
+from pipeline.options import Options
+from pipeline.predict.stars import PredictedStars, StarPredictionOptions, predict_stars
+from pipeline.records import BoolArray, FloatArray, Image, StarTable, State
+from pipeline.status import StatusReason
+from pipeline.techniques.base import NavContext, TechniqueFailure, TechniqueResult
+from pipeline.techniques.star_field import StarFieldOptions, star_field_nav
+from pipeline.techniques.star_refine import StarRefineOptions, star_refine_nav
+from pipeline.techniques.star_unique import StarUniqueOptions, star_unique_nav
+
+
+class TechniquesOptions(Options):
+    """One block per technique, under the technique's own name."""
+
+    StarFieldFromCatalogNav: StarFieldOptions = StarFieldOptions()
+    StarUniqueMatchNav: StarUniqueOptions = StarUniqueOptions()
+    StarRefineNav: StarRefineOptions = StarRefineOptions()
+
+
+class NavigationOptions(Options):
+    """Everything that steers one image."""
+
+    frame: FrameOptions = FrameOptions()
+    detection: DetectionOptions = DetectionOptions()
+    stars: StarPredictionOptions = StarPredictionOptions()
+    techniques: TechniquesOptions = TechniquesOptions()
+    ensemble: EnsembleOptions = Field(default_factory=EnsembleOptions)
+
+
+@dataclass(frozen=True)
+class Navigation:
+    """What became of one image.
+
+    Attributes
+    ----------
+    state
+        Its geometry.
+    frame
+        The measured image, None where it was refused.
+    estimate
+        Fused answer, None where there is none.
+    results, failures
+        Techniques with and without an answer, in the order in which they ran.
+    reason, detail
+        How the image ends, and one line about it.
+    """
+
+    state: State
+    frame: Frame | None
+    estimate: _CombinedEstimate | None
+    results: tuple[TechniqueResult, ...]
+    failures: tuple[TechniqueFailure, ...]
+    reason: StatusReason
+    detail: str
+
+
+StageListener = Callable[[str], None]
+_Outcome = TechniqueResult | TechniqueFailure
+
+
+def navigate(
+    pixels: Image,
+    flagged: BoolArray | None,
+    state: State,
+    stars: StarTable,
+    options: NavigationOptions,
+    on_stage: StageListener = lambda stage: None,
+) -> Navigation:
+    """Navigate one image.
+
+    Parameters
+    ----------
+    pixels
+        (rows, cols) DN as read.
+    flagged
+        (rows, cols) True where the product marks a pixel as bad, or None.
+    state
+        Geometry.
+    stars
+        Catalogue rows around the field.
+    options
+        All stages' options.
+    on_stage
+        Called with a stage's name when that stage has ended; clocks live with the caller.
+
+    Returns
+    -------
+    Navigation
+        Always: an image that cannot be navigated says why.
+    """
+    context = NavContext.of(state)
+    try:
+        frame = make_frame(pixels, flagged, state, options.frame)
+    except ImageFailure as failure:
+        return Navigation(state, None, None, (), (), failure.reason, failure.detail)
+    on_stage("frame")
+    predicted = predict_stars(stars, state, frame, options.stars)
+    on_stage("predict")
+    outcomes = _first_pass(predicted, frame, context, options, on_stage)
+    first = _fuse(outcomes, context, state, options)
+    if first is not None and first.reason is StatusReason.NAVIGATED:
+        outcomes += _second_pass(predicted, frame, first, context, options)
+        on_stage("refine")
+    estimate = _fuse(outcomes, context, state, options)
+    on_stage("ensemble")
+    return _conclude(state, frame, estimate, outcomes)
+
+
+def _first_pass(
+    predicted: PredictedStars, frame: Frame, context: NavContext, options: NavigationOptions, on_stage: StageListener
+) -> list[_Outcome]:
+    """Techniques that need no prior."""
+    techniques = options.techniques
+    if not len(predicted):
+        reason = StatusReason.NO_FEATURES_PREDICTED
+        return [TechniqueFailure("StarFieldFromCatalogNav", reason, "no catalogue star in or near the frame")]
+    sources = detect_point_sources(
+        frame.pixels, frame.bad, frame.saturated, frame.sigma, frame.gain_e_per_dn, frame.spread, options.detection
+    )
+    on_stage("detect")
+    threshold = options.detection.threshold_sigma
+    outcomes: list[_Outcome] = []
+    if techniques.StarFieldFromCatalogNav.enabled:
+        outcomes.append(star_field_nav(predicted, sources, threshold, context, techniques.StarFieldFromCatalogNav))
+        on_stage("star_field")
+    if techniques.StarUniqueMatchNav.enabled:
+        outcomes.append(star_unique_nav(predicted, sources, threshold, context, techniques.StarUniqueMatchNav))
+        on_stage("star_unique")
+    return outcomes
+
+
+def _second_pass(
+    predicted: PredictedStars,
+    frame: Frame,
+    prior: _CombinedEstimate,
+    context: NavContext,
+    options: NavigationOptions,
+) -> list[_Outcome]:
+    """Refiners inside the first answer, on features predicted again with the corrected attitude."""
+    refine = options.techniques.StarRefineNav
+    if not refine.enabled:
+        return []
+    return [
+        star_refine_nav(
+            predicted, frame, prior.offset_vu, prior.rotation_rad or 0.0, prior.covariance, prior.confidence, context,
+            options.detection, refine,
+        )
+    ]  # fmt: skip
+
+
+def _fuse(
+    outcomes: list[_Outcome], context: NavContext, state: State, options: NavigationOptions
+) -> _CombinedEstimate | None:
+    results = [outcome for outcome in outcomes if isinstance(outcome, TechniqueResult)]
+    return ensemble(results, context, options.ensemble, _rotation_prior(state.attitude.sigma_rad))
+
+
+def _rotation_prior(sigma_rad: FloatArray | None) -> float | None:
+    """A-priori sigma of the twist about the boresight, where the attitude brings one."""
+    return float(sigma_rad[2]) if sigma_rad is not None and sigma_rad[2] > 0 else None
+
+
+# The reason that says most about an image without an answer comes first.
+_TELLING = (
+    StatusReason.AMBIGUOUS_MATCH,
+    StatusReason.NO_MATCH,
+    StatusReason.NO_FEATURES_DETECTED,
+    StatusReason.NO_FEATURES_PREDICTED,
+)
+
+
+def _conclude(
+    state: State, frame: Frame, estimate: _CombinedEstimate | None, outcomes: list[_Outcome]
+) -> Navigation:
+    results = tuple(outcome for outcome in outcomes if isinstance(outcome, TechniqueResult))
+    failures = tuple(outcome for outcome in outcomes if isinstance(outcome, TechniqueFailure))
+    if estimate is not None:
+        detail = f"fused from {', '.join(estimate.members)}"
+        return Navigation(state, frame, estimate, results, failures, estimate.reason, detail)
+    if not failures:
+        return Navigation(state, frame, None, (), (), StatusReason.NO_MATCH, "no technique is enabled")
+    worst = min(failures, key=lambda failure: _TELLING.index(failure.reason))
+    # Among failures of one kind the pattern of many stars has said the most.
+    return Navigation(state, frame, None, (), failures, worst.reason, f"{worst.technique}: {worst.detail}")
+
+
+def corrected_sigma_px(estimate: _CombinedEstimate) -> FloatArray:
+    """1-sigma of the fused offset along v and u.
+
+    Parameters
+    ----------
+    estimate
+        Fused answer.
+
+    Returns
+    -------
+    numpy.ndarray
+        (2,) pixels, NaN where only one direction is known.
+    """
+    return np.asarray(np.sqrt(np.diag(estimate.covariance)[:2]))

@@ -1,0 +1,1 @@
+"""Techniques: each measures where predicted features really are, and says how well."""

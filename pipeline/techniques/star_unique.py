@@ -1,0 +1,171 @@
+"""StarUniqueMatchNav: one or two stars that nothing else in the frame can be taken for."""
+
+from itertools import combinations
+
+import numpy as np
+from pydantic import Field
+
+from pipeline.geometry.procrustes import pair_rotation
+from pipeline.imaging.psf import PointSources
+from pipeline.predict.stars import PredictedStars
+from pipeline.status import StatusReason
+from pipeline.techniques.base import NavContext, TechniqueFailure, TechniqueOptions, TechniqueResult, edge_flags
+from pipeline.techniques.star_field import pair_covariance
+from pipeline.techniques.star_fit import StarFitOptions, fit_stars
+from pipeline.techniques.star_inventory import star_inventory
+from pipeline.techniques.star_match import (
+    Hypothesis,
+    IntArray,
+    MatchProblem,
+    StarMatchOptions,
+    assignment_log_odds,
+    chance_visible,
+    magnitude_log_ratio,
+    mask_of,
+    match_problem,
+    posterior,
+    same_answer,
+    similarity,
+)
+
+NAME = "StarUniqueMatchNav"
+
+
+class StarUniqueOptions(TechniqueOptions):
+    """Options of the one- and two-star technique."""
+
+    match: StarMatchOptions = StarMatchOptions()
+    fit: StarFitOptions = StarFitOptions()
+    brightest: int = Field(4, ge=1, le=20, description="brightest predicted stars tried")
+    max_sources: int = Field(60, ge=1, le=500, description="brightest detections tried")
+    separation_px: float = Field(1.5, gt=0, le=20, description="largest error of a pair's separation, pixels")
+    min_probability_pair: float = Field(0.999, gt=0.5, lt=1, description="posterior probability asked of two stars")
+    min_probability_single: float = Field(0.98, gt=0.5, lt=1, description="posterior probability asked of one star")
+
+
+def star_unique_nav(
+    stars: PredictedStars,
+    sources: PointSources,
+    detection_sigma: float,
+    context: NavContext,
+    options: StarUniqueOptions,
+) -> TechniqueResult | TechniqueFailure:
+    """Match the brightest one or two stars where their brightness (and separation) leaves no second reading.
+
+    Parameters
+    ----------
+    stars
+        Predictions, brightest first.
+    sources
+        Detections, brightest first.
+    detection_sigma
+        Threshold with which they were found.
+    context
+        Camera, attitude, bounds.
+    options
+        Limits.
+
+    Returns
+    -------
+    TechniqueResult or TechniqueFailure
+        With two stars the rotation is ``atan2(cross, dot)`` about their centroid; with one it is unobservable.
+    """
+    if not len(stars):
+        return TechniqueFailure(NAME, StatusReason.NO_FEATURES_PREDICTED, "no stars predicted")
+    if not len(sources):
+        return TechniqueFailure(NAME, StatusReason.NO_FEATURES_DETECTED, "no point sources detected")
+    bright = stars.take(np.arange(min(len(stars), options.brightest)))
+    kept = sources.take(np.arange(min(len(sources), options.max_sources)))
+    problem = match_problem(bright, kept, detection_sigma, context, options.match)
+    ratio = magnitude_log_ratio(problem, options.match)
+    visible = chance_visible(problem)
+    best_chance = 0.0
+    for find, threshold in ((_pairs, options.min_probability_pair), (_singles, options.min_probability_single)):
+        hypotheses = find(problem, ratio, options)
+        if not hypotheses:
+            continue
+        probability = posterior(np.array([h.log_odds for h in hypotheses]), visible[hypotheses[0].star])
+        best_chance = max(best_chance, float(probability[0]))
+        if probability[0] >= threshold:
+            return _result(stars, sources, hypotheses[0], float(probability[0]), context, options)
+    return TechniqueFailure(NAME, StatusReason.AMBIGUOUS_MATCH, f"no unmistakable star, best probability {best_chance:.4f}")
+
+
+def _pairs(problem: MatchProblem, ratio: np.ndarray, options: StarUniqueOptions) -> list[Hypothesis]:
+    """Every pair of bright stars on every pair of detections with its separation and an allowed rotation."""
+    found: list[Hypothesis] = []
+    m = len(problem.measured_vu)
+    first, second = (index.ravel() for index in np.meshgrid(np.arange(m), np.arange(m), indexing="ij"))
+    span = np.linalg.norm(problem.measured_vu[first] - problem.measured_vu[second], axis=1)
+    for a, b in combinations(range(len(problem.predicted_vu)), 2):
+        star = np.array([a, b])
+        length = float(np.linalg.norm(problem.predicted_vu[a] - problem.predicted_vu[b]))
+        fits = (first != second) & (np.abs(span - length) <= options.separation_px)
+        fits &= (ratio[a, first] > -9) & (ratio[b, second] > -9)
+        for j, k in zip(first[fits], second[fits], strict=True):
+            hypothesis = _pair_hypothesis(problem, ratio, star, np.array([j, k]), options)
+            if hypothesis is not None:
+                found.append(hypothesis)
+    return _distinct(found, problem)
+
+
+def _pair_hypothesis(
+    problem: MatchProblem, ratio: np.ndarray, star: IntArray, source: IntArray, options: StarUniqueOptions
+) -> Hypothesis | None:
+    theta = pair_rotation(problem.predicted_vu[star], problem.measured_vu[source])
+    length = float(np.linalg.norm(np.diff(problem.predicted_vu[star], axis=0)))
+    if abs(theta) > problem.context.max_rotation_rad + options.separation_px / max(length, 1e-6):
+        return None
+    offset, theta = similarity(problem, star, source)
+    log_odds = assignment_log_odds(problem, ratio, star, source, offset, theta, options.match)
+    return Hypothesis(star, source, offset, theta, log_odds) if np.isfinite(log_odds) else None
+
+
+def _singles(problem: MatchProblem, ratio: np.ndarray, options: StarUniqueOptions) -> list[Hypothesis]:
+    """The brightest star on every detection within the margin."""
+    found: list[Hypothesis] = []
+    star = np.array([0])
+    for j in range(len(problem.measured_vu)):
+        source = np.array([j])
+        offset, _ = similarity(problem, star, source)
+        log_odds = assignment_log_odds(problem, ratio, star, source, offset, 0.0, options.match, considered=star)
+        if np.isfinite(log_odds):
+            found.append(Hypothesis(star, source, offset, 0.0, log_odds))
+    found.sort(key=lambda h: -h.log_odds)
+    return found
+
+
+def _distinct(found: list[Hypothesis], problem: MatchProblem) -> list[Hypothesis]:
+    """Best first, without those that give the same answer as a better one."""
+    found.sort(key=lambda h: -h.log_odds)
+    reach = float(np.hypot(*problem.shape_vu)) / 2
+    distinct: list[Hypothesis] = []
+    for hypothesis in found[:50]:
+        if not any(same_answer(hypothesis, other, reach) for other in distinct):
+            distinct.append(hypothesis)
+    return distinct
+
+
+def _result(
+    stars: PredictedStars,
+    sources: PointSources,
+    best: Hypothesis,
+    probability: float,
+    context: NavContext,
+    options: StarUniqueOptions,
+) -> TechniqueResult:
+    covariance = pair_covariance(stars, sources, best.star, best.source)
+    fit = fit_stars(
+        context, stars.direction[best.star], stars.position_vu[best.star], sources.position_vu[best.source], covariance,
+        options.fit,
+    )  # fmt: skip
+    at_edge, at_edge_rotation = edge_flags(fit.centre_offset_vu, fit.rotation_rad, context, options)
+    return TechniqueResult(
+        technique=NAME, offset_vu=fit.offset_vu, rotation_rad=fit.rotation_rad, information=fit.information,
+        pivot_vu=fit.pivot_vu, confidence=probability, at_edge=at_edge, at_edge_rotation=at_edge_rotation,
+        error_sources=("stars",),
+        features=star_inventory(
+            stars, sources, best.star, best.source, fit, context, mask_of(best.star, len(stars))
+        ),
+        diagnostics={"stars_used": len(best.star), "extra_sigma_px": fit.extra_sigma_px, "log_odds": best.log_odds},
+    )  # fmt: skip
