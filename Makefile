@@ -1,0 +1,37 @@
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+DEMO := outputs/demo
+
+.PHONY: install demo test quick check bench clean
+
+install: $(VENV)/installed
+
+$(VENV)/installed: requirements.lock pyproject.toml
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements.lock
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --editable .
+	touch $@
+
+demo: install
+	rm -rf $(DEMO)
+	$(BIN)/pilotage sample stars $(DEMO)/stars
+	$(BIN)/pilotage run $(DEMO)/stars --output $(DEMO)/run || test $$? -eq 1
+	$(BIN)/pilotage show $(DEMO)/run --truth $(DEMO)/stars/truth.json --limit 20
+	@echo "The archive is in $(DEMO)/stars, the answers in $(DEMO)/run: offsets/ and the other tables, images/*.json."
+
+test: install
+	$(BIN)/python -m pytest -n 2
+
+quick: install
+	$(BIN)/python -m pytest -n 2 -m "not slow"
+
+check: install
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+
+bench: install
+	$(BIN)/python -m workflows.bench
+
+clean:
+	rm -rf $(VENV) $(DEMO)

@@ -1,0 +1,58 @@
+"""Schema of the camera blocks in ``catalogs/config/config_4N0_inst_*.yaml``."""
+
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import Field
+
+from pipeline.options import InstrumentSettings, Options
+from pipeline.records import CameraModel, Detector
+
+Pair = tuple[float, float]
+Triple = tuple[float, float, float]
+
+
+class CameraMode(Options):
+    """One read-out mode of a camera: array, optics and detector."""
+
+    shape_vu: tuple[Annotated[int, Field(ge=16, le=16384)], Annotated[int, Field(ge=16, le=16384)]]
+    focal_length_mm: float = Field(gt=0)
+    k_px_per_mm: tuple[Pair, Pair] = Field(description="[[Kx, Kxy], [Kyx, Ky]], photo-plane mm to (u, v) pixels")
+    principal_point_vu: Pair
+    distortion_eps: tuple[float, float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    search_margin_vu: Pair | None = Field(None, description="replaces the block's margin in this mode, pixels")
+    psf_sigma_px: float | None = Field(None, gt=0.1, le=20)
+    psf_misfit: float | None = Field(None, gt=0, le=1, description="share of a star's light off the Gaussian")
+    model_residual_px: float = Field(0.0, ge=0, le=10, description="1-sigma of what the camera model leaves out")
+    read_noise_dn: float | None = Field(None, ge=0)
+    gain_e_per_dn: float | None = Field(None, gt=0)
+    bias_dn: float = 0.0
+    saturation_dn: float | None = None
+    missing_value: float | None = None
+    star_dn_per_s_mag0: float | None = Field(None, gt=0)
+
+    def camera_model(self) -> CameraModel:
+        """Optics as a record."""
+        return CameraModel(
+            self.shape_vu, self.focal_length_mm, np.array(self.k_px_per_mm), np.array(self.principal_point_vu),
+            np.array(self.distortion_eps),
+        )  # fmt: skip
+
+    def detector(self) -> Detector:
+        """Detector as a record."""
+        return Detector(
+            self.psf_sigma_px, self.psf_misfit, self.model_residual_px, self.read_noise_dn, self.gain_e_per_dn,
+            self.bias_dn, self.saturation_dn, self.missing_value, self.star_dn_per_s_mag0,
+        )  # fmt: skip
+
+
+class InstrumentBlock(InstrumentSettings):
+    """One camera: who it is, how its headers are told, and its modes."""
+
+    mission: str
+    camera: str
+    header: Literal["lorri"] | None = Field(None, description="reader of pointing cards in the product's own label")
+    identify: dict[str, str] = Field(default_factory=dict, description="header cards that mark this camera's products")
+    product_id_pattern: str | None = Field(None, description="regular expression of a file stem that is a product id")
+    quality_extension: str | None = Field(None, description="name of the extension whose non-zero pixels are bad")
+    modes: dict[str, CameraMode]

@@ -1,0 +1,217 @@
+"""The command ``pilotage``."""
+
+import contextlib
+import signal
+import sys
+import time
+from collections import Counter
+from pathlib import Path
+from typing import Annotated
+
+import click
+import typer
+import yaml
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from catalogs.archive import Archive, open_archive
+from pipeline.errors import ConfigurationError, PilotageError
+from workflows import catalog_cli, sample_cli
+from workflows.config import Configuration, load_configuration, parse_setting
+from workflows.execute import ClusterOptions
+from workflows.plan import Plan, make_plan
+from workflows.report import (
+    compare,
+    offsets,
+    print_comparison,
+    print_counts,
+    print_image,
+    progress_of,
+    read_truth,
+)
+from workflows.run import EXIT_INTERRUPTED, EXIT_NOT_STARTED, RunListener, execute, exit_code, prepare_folder
+from workflows.store import RunFolder, read_json
+from workflows.task import Outcome
+
+app = typer.Typer(
+    name="pilotage", no_args_is_help=True, add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False,
+    help="Navigate archives of planetary images: pointing offsets, rotations and uncertainties that hold.",
+)  # fmt: skip
+app.add_typer(sample_cli.app, name="sample")
+app.add_typer(catalog_cli.app, name="catalog")
+
+_ARCHIVE_KEY = "archive."
+_LOG_EVERY_S = 5.0
+
+ArchiveArg = Annotated[str, typer.Argument(help="Folder or URL with an archive.yaml, or the path of one.")]
+RunArg = Annotated[Path, typer.Argument(help="Folder of a run.")]
+ConfigOption = Annotated[list[Path], typer.Option("--config", help="YAML file on top of the shipped ones (repeatable).")]
+SetOption = Annotated[
+    list[str], typer.Option("--set", help="One key, a.b=c; archive.KEY=VALUE replaces a key of archive.yaml (repeatable).")
+]
+OutputOption = Annotated[Path, typer.Option("--output", "-o", help="Folder of the run; an earlier run there is resumed.")]
+VerifyOption = Annotated[bool, typer.Option("--verify", help="Read inputs again instead of trusting size and time.")]
+
+
+def _open(archive: str, config: list[Path], settings: list[str]) -> tuple[Archive, Configuration]:
+    mine = [s for s in settings if not s.startswith(_ARCHIVE_KEY)]
+    overrides: dict[str, object] = {}
+    for setting in settings:
+        if setting.startswith(_ARCHIVE_KEY):
+            _merge(overrides, parse_setting(setting.removeprefix(_ARCHIVE_KEY)))
+    configuration = load_configuration(config, mine)
+    return open_archive(archive, overrides), configuration
+
+
+def _merge(tree: dict[str, object], addition: dict[str, object]) -> None:
+    for key, value in addition.items():
+        old = tree.get(key)
+        if isinstance(old, dict) and isinstance(value, dict):
+            _merge(old, value)
+        else:
+            tree[key] = value
+
+
+@app.command()
+def plan(
+    archive: ArchiveArg,
+    output: OutputOption,
+    config: ConfigOption = [],  # noqa: B006 - typer's way of declaring a repeatable option
+    settings: SetOption = [],  # noqa: B006
+    verify: VerifyOption = False,
+) -> None:
+    """Say what `run` would do, and do nothing."""
+    work = make_plan(*_open(archive, config, settings), RunFolder(output), verify)
+    typer.echo(f"{len(work.every)} images, {len(work.every) - len(work.todo)} answered, {len(work.todo)} to do")
+    for ref in work.todo[:20]:
+        typer.echo(f"  {ref.image_id}  {ref.path}{'' if ref.exists else '  (not there)'}")
+    if len(work.todo) > 20:
+        typer.echo(f"  ... and {len(work.todo) - 20} more")
+
+
+@app.command()
+def run(
+    archive: ArchiveArg,
+    output: OutputOption,
+    workers: Annotated[int, typer.Option(min=1, max=1024, help="Worker processes of a local cluster.")] = 2,
+    serial: Annotated[bool, typer.Option("--serial", help="No cluster: one image after the other.")] = False,
+    scheduler: Annotated[str | None, typer.Option(help="Address of an existing Dask scheduler.")] = None,
+    memory_limit: Annotated[str, typer.Option(help="Per local worker; one beyond it is restarted.")] = "4GiB",
+    config: ConfigOption = [],  # noqa: B006
+    settings: SetOption = [],  # noqa: B006
+    verify: VerifyOption = False,
+) -> None:
+    """Navigate an archive; run again after a kill or a change, and only what is missing is done.
+
+    Exit code: 0 all images navigated, 1 some failed or conflicted, 2 some in error, 3 could not start.
+    """
+    if serial and scheduler:
+        raise ConfigurationError("--serial and --scheduler exclude each other")
+    folder = RunFolder(output)
+    opened, configuration = _open(archive, config, settings)
+    prepare_folder(folder)
+    work = make_plan(opened, configuration, folder, verify)
+    options = ClusterOptions(0 if serial else workers, scheduler, memory_limit)
+    console = Console(stderr=True)
+    with _follow(console, work) as listener:
+        statuses = execute(work, options, listener)
+    counts = ", ".join(f"{count} {status}" for status, count in sorted(statuses.items()))
+    console.print(f"{len(work.every)} images: {counts}. Tables and images/*.json in {output}", highlight=False, soft_wrap=True)
+    raise typer.Exit(exit_code(statuses))
+
+
+@contextlib.contextmanager
+def _follow(console: Console, work: Plan):  # type: ignore[no-untyped-def]
+    """Progress bar on a terminal, plain lines in a log."""
+    counts: Counter[str] = Counter()
+    total, started = len(work.todo), time.monotonic()
+
+    def line() -> str:
+        done = sum(counts.values())
+        rate = done / max(time.monotonic() - started, 1e-9)
+        parts = " ".join(f"{status}:{count}" for status, count in sorted(counts.items()))
+        return f"{rate:.1f} images/s  {parts}"
+
+    answered = len(work.every) - total
+    console.print(f"{len(work.every)} images, {answered} answered before, {total} to do", highlight=False)
+    if console.is_terminal:
+        columns = (TextColumn("navigating"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), TextColumn("{task.description}"))
+        with Progress(*columns, console=console) as progress:
+            task = progress.add_task("", total=total)
+
+            def on_done(outcome: Outcome) -> None:
+                counts[outcome.status] += 1
+                progress.update(task, advance=1, description=line())
+
+            yield RunListener(lambda text: progress.console.print(text, highlight=False), on_done)
+        return
+    last = time.monotonic()
+
+    def log_done(outcome: Outcome) -> None:
+        nonlocal last
+        counts[outcome.status] += 1
+        done = sum(counts.values())
+        if time.monotonic() - last > _LOG_EVERY_S or done == total:
+            last = time.monotonic()
+            left = (total - done) * (last - started) / done
+            console.print(f"{done}/{total}  {line()}  {left:.0f} s left", highlight=False, soft_wrap=True)
+
+    yield RunListener(lambda text: console.print(text, highlight=False, soft_wrap=True), log_done)
+
+
+@app.command()
+def status(run_folder: RunArg) -> None:
+    """Say how far a run is, from its files alone."""
+    planned, statuses, finished = progress_of(RunFolder(run_folder))
+    done = sum(statuses.values())
+    counts = ", ".join(f"{count} {name}" for name, count in sorted(statuses.items())) or "none yet"
+    typer.echo(f"{done} of {planned} images done ({counts}); {'finished' if finished else 'not finished'}")
+
+
+@app.command()
+def show(
+    run_folder: RunArg,
+    image: Annotated[str | None, typer.Argument(help="Image id.")] = None,
+    truth: Annotated[Path | None, typer.Option(help="truth.json of a sample archive to compare with.")] = None,
+    limit: Annotated[int, typer.Option(min=1, help="Most rows shown.")] = 40,
+) -> None:
+    """Show outcome counts, one image, or a run against planted truth."""
+    folder, console = RunFolder(run_folder), Console()
+    if image is not None:
+        document = read_json(folder.document(image))
+        if document is None:
+            raise ConfigurationError(f"{run_folder} has no image {image}")
+        print_image(console, document)
+        return
+    table = offsets(folder)
+    print_counts(console, table)
+    if truth is not None:
+        print_comparison(console, *compare(table, read_truth(truth)), limit)
+
+
+@app.command("config")
+def show_config(config: ConfigOption = [], settings: SetOption = []) -> None:  # noqa: B006
+    """Print the configuration that a run would use, as YAML."""
+    typer.echo(yaml.safe_dump(load_configuration(config, settings).model_dump(mode="json"), sort_keys=False))
+
+
+def main() -> None:
+    """Entry point: one line per error, and exit codes that scripts can rely on."""
+    # A pipe that is closed early (`| head`) ends the program quietly, as for any Unix tool.
+    signal.signal(signal.SIGPIPE, signal.SIG_DFL)
+    try:
+        code = app(standalone_mode=False)
+    except PilotageError as error:
+        typer.echo(f"pilotage: {error}", err=True)
+        code = EXIT_NOT_STARTED
+    except click.ClickException as error:
+        error.show()
+        code = EXIT_NOT_STARTED
+    except (KeyboardInterrupt, click.Abort):
+        typer.echo("pilotage: interrupted; run the same command again to go on", err=True)
+        code = EXIT_INTERRUPTED
+    sys.exit(code if isinstance(code, int) else 0)
+
+
+if __name__ == "__main__":
+    main()

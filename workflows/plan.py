@@ -1,0 +1,283 @@
+"""What is to be done: images, their inputs, and which of them an earlier run has already answered."""
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from importlib.metadata import version
+from importlib.resources import files
+from pathlib import Path
+
+from pydantic import ValidationError
+
+from catalogs.archive import (
+    SIDECAR_SUFFIX,
+    STARS_SUFFIX,
+    Archive,
+    ImageRef,
+    StarTableRef,
+    file_stamp,
+    list_images,
+    stem,
+)
+from catalogs.geometry import first_problem
+from catalogs.star_sources import TableProblem, read_table
+from catalogs.stars import BUILT_IN_NAMES, StarIndex, added_index, build_index, built_in_index, cache_folder, open_index
+from pipeline.curate import Json
+from pipeline.errors import ConfigurationError
+from pipeline.options import InstrumentSettings
+from workflows.config import Configuration
+from workflows.store import RunFolder, read_json
+
+PER_IMAGE = "per-image"
+
+
+@dataclass(frozen=True)
+class Setup:
+    """What every worker needs, small enough to be sent to it.
+
+    Attributes
+    ----------
+    archive
+        Root and description.
+    configuration
+        All options.
+    star_indexes
+        Paths of memory-mapped catalogues.
+    star_digests
+        (name, sha256) of each.
+    per_image_stars
+        Whether images bring star tables of their own.
+    run_folder
+        Output.
+    software
+        Version and digest of the code.
+    """
+
+    archive: Archive
+    configuration: Configuration
+    star_indexes: tuple[Path, ...]
+    star_digests: tuple[tuple[str, str], ...]
+    per_image_stars: bool
+    run_folder: RunFolder
+    software: str
+
+    def inputs_of(self, ref: ImageRef) -> tuple[str, ...]:
+        """Paths, relative to the archive, whose bytes decide an image's answer."""
+        paths = [ref.path]
+        if self.archive.description.geometry != "header":
+            paths.append(stem(ref.path) + SIDECAR_SUFFIX)
+        if self.per_image_stars:
+            paths.append(stem(ref.path) + STARS_SUFFIX)
+        return tuple(paths)
+
+    def task_id(self, image_id: str, digests: Mapping[str, str | None]) -> str:
+        """Deterministic id of one image's work: identity, options, code, and digests of everything read."""
+        description = self.archive.description.model_dump(mode="json", exclude={"name", "images"})
+        parts: list[object] = [
+            image_id, self.configuration.digest(), self.software, description, list(self.star_digests),
+            sorted(digests.items()),
+        ]  # fmt: skip
+        return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Work of one run.
+
+    Attributes
+    ----------
+    setup
+        For the workers.
+    every
+        All images, sorted by id.
+    todo
+        Those that have no answer yet, or whose inputs have changed.
+    """
+
+    setup: Setup
+    every: tuple[ImageRef, ...]
+    todo: tuple[ImageRef, ...]
+
+
+def make_plan(archive: Archive, configuration: Configuration, run_folder: RunFolder, verify: bool = False) -> Plan:
+    """List an archive's images and find out which are still to be done.
+
+    Parameters
+    ----------
+    archive
+        Opened archive.
+    configuration
+        All options.
+    run_folder
+        Output, which may hold an earlier run.
+    verify
+        Read every input again instead of trusting size and modification time.
+
+    Returns
+    -------
+    Plan
+        Nothing has been written.
+
+    Raises
+    ------
+    ConfigurationError
+        If the archive or one of its star tables cannot be used.
+    """
+    name = archive.description.instrument
+    if name is not None and name not in configuration.instruments:
+        raise ConfigurationError(f"instrument {name} is not configured; known: {', '.join(configuration.instruments)}")
+    _check_settings(archive)
+    indexes, per_image = open_star_tables(archive)
+    setup = Setup(
+        archive, configuration, tuple(index.path for index in indexes),
+        tuple((index.name, index.sha256) for index in indexes), per_image, run_folder, software_id(),
+    )  # fmt: skip
+    every = list_images(archive, configuration.instruments)
+    todo = [ref for ref in every if not _is_done(ref, setup, verify)]
+    return Plan(setup, tuple(every), tuple(todo))
+
+
+def _check_settings(archive: Archive) -> None:
+    try:
+        InstrumentSettings.model_validate(archive.description.settings)
+    except ValidationError as error:
+        allowed = ", ".join(InstrumentSettings.model_fields)
+        raise ConfigurationError(f"{archive.url}: settings.{first_problem(error)} (keys: {allowed})") from error
+
+
+def open_star_tables(archive: Archive) -> tuple[list[StarIndex], bool]:
+    """Indexes of an archive's star tables, made where they are not yet.
+
+    Parameters
+    ----------
+    archive
+        The archive.
+
+    Returns
+    -------
+    tuple
+        Indexes; whether per-image tables are wanted too.
+
+    Raises
+    ------
+    ConfigurationError
+        If a table is unknown, missing or not valid.
+    """
+    listed = archive.description.stars
+    entries = [listed] if isinstance(listed, str) else listed
+    tables = [_star_index(archive, entry) for entry in entries if entry != PER_IMAGE]
+    return tables, PER_IMAGE in entries
+
+
+def _star_index(archive: Archive, entry: str | StarTableRef) -> StarIndex:
+    folder = cache_folder()
+    try:
+        if isinstance(entry, str):
+            if entry in BUILT_IN_NAMES:
+                return built_in_index(entry, folder)
+            added = added_index(entry, folder)
+            if added is None:
+                known = ", ".join((*BUILT_IN_NAMES, PER_IMAGE))
+                raise ConfigurationError(f"stars: {entry} is neither {known} nor added by `pilotage catalog add`")
+            return open_index(added)
+        data = archive.read(entry.path)
+        apparent = entry.place == "apparent"
+        digest = hashlib.sha256(data + entry.place.encode()).hexdigest()
+        return build_index(read_table(data, entry.path, apparent), entry.path, digest, folder)
+    except FileNotFoundError as error:
+        raise ConfigurationError(f"stars: {error.filename or entry} is not there") from error
+    except TableProblem as error:
+        raise ConfigurationError(f"stars: {error}") from error
+    except OSError as error:
+        raise ConfigurationError(f"star index in {folder}: {error}") from error
+
+
+def _is_done(ref: ImageRef, setup: Setup, verify: bool) -> bool:
+    """Whether the run folder holds this image's answer to these very inputs."""
+    mark = read_json(setup.run_folder.mark(ref.image_id))
+    if mark is None or not setup.run_folder.document(ref.image_id).exists():
+        return False
+    recorded = mark.get("inputs")
+    if not isinstance(recorded, dict) or set(recorded) != set(setup.inputs_of(ref)):
+        return False
+    digests: dict[str, str | None] = {}
+    for path, entry in recorded.items():
+        digest = _known_digest(setup.archive, path, entry, verify)
+        if digest is _CHANGED:
+            return False
+        digests[path] = digest
+    return mark.get("task_id") == setup.task_id(ref.image_id, digests)
+
+
+_CHANGED = "changed"
+
+
+def _known_digest(archive: Archive, path: str, entry: Json, verify: bool) -> str | None:
+    """Digest of an input: recorded if the file looks unchanged, read if asked for; None where there is no file."""
+    stamp = file_stamp(archive.url, path)
+    recorded = entry if isinstance(entry, dict) else {}
+    if stamp is None:
+        return None if recorded.get("sha256") is None else _CHANGED
+    if verify:
+        return hashlib.sha256(archive.read(path)).hexdigest()
+    sha256 = recorded.get("sha256")
+    same = [recorded.get("size"), recorded.get("mark")] == list(stamp)
+    return sha256 if same and isinstance(sha256, str) else _CHANGED
+
+
+@lru_cache(maxsize=1)
+def software_id() -> str:
+    """Version of Pilotage and digest of its source, so that changed code does not pass for the old one.
+
+    Returns
+    -------
+    str
+        For example ``pilotage 0.1.0 (3f2a…)``.
+    """
+    digest = hashlib.sha256()
+    for package in ("pipeline", "catalogs", "workflows"):
+        root = Path(str(files(package)))
+        for path in sorted(root.rglob("*.py")):
+            digest.update(path.relative_to(root).as_posix().encode())
+            digest.update(path.read_bytes())
+    return f"pilotage {version('pilotage')} ({digest.hexdigest()[:12]})"
+
+
+def input_marks(archive: Archive, digests: Mapping[str, str | None]) -> dict[str, Json]:
+    """Record of inputs for an image's mark: digest, size and modification time of each.
+
+    Parameters
+    ----------
+    archive
+        The archive.
+    digests
+        sha256 by path, None for files that are not there.
+
+    Returns
+    -------
+    dict
+        JSON values.
+    """
+    marks: dict[str, Json] = {}
+    for path, sha256 in digests.items():
+        stamp = file_stamp(archive.url, path) if sha256 is not None else None
+        marks[path] = {"sha256": sha256, "size": stamp[0] if stamp else None, "mark": stamp[1] if stamp else None}
+    return marks
+
+
+def ids_of(refs: Sequence[ImageRef]) -> list[str]:
+    """Image ids, in order.
+
+    Parameters
+    ----------
+    refs
+        Images.
+
+    Returns
+    -------
+    list of str
+        Their ids.
+    """
+    return [ref.image_id for ref in refs]

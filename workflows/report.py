@@ -1,0 +1,256 @@
+"""What the terminal shows: plans, outcomes, one image, and a run against planted truth."""
+
+import json
+import math
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import duckdb
+import numpy as np
+import pandas as pd
+from rich.console import Console
+from rich.table import Table
+
+from pipeline.curate import Json
+from pipeline.errors import ConfigurationError
+from workflows.store import RunFolder, read_json
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """A run against planted truth.
+
+    Attributes
+    ----------
+    images, answered
+        Images with truth, and those of them with a full answer.
+    median_error_px
+        Of the distance between recovered and planted offset.
+    pull_rms
+        Of error over sigma, both axes.
+    within_two_sigma
+        Share of axes whose error is at most two sigmas.
+    false_successes
+        Answers off by more than five sigmas and a pixel.
+    """
+
+    images: int
+    answered: int
+    median_error_px: float
+    pull_rms: float
+    within_two_sigma: float
+    false_successes: tuple[str, ...]
+
+
+def offsets(folder: RunFolder) -> pd.DataFrame:
+    """Table ``offsets`` of a run.
+
+    Parameters
+    ----------
+    folder
+        The run.
+
+    Returns
+    -------
+    pandas.DataFrame
+        One row per image, sorted by id.
+
+    Raises
+    ------
+    ConfigurationError
+        If there is no such table.
+    """
+    files = sorted((folder.root / "offsets").rglob("*.parquet"))
+    if not files:
+        raise ConfigurationError(f"{folder.root} holds no finished run: it has no table offsets")
+    with duckdb.connect() as database:
+        relation = database.read_parquet([str(path) for path in files], hive_partitioning=True)
+        return relation.order("image_id").df()
+
+
+def read_truth(path: Path) -> dict[str, dict[str, float]]:
+    """Planted offsets by image id.
+
+    Parameters
+    ----------
+    path
+        A ``truth.json``: ``frames`` maps an image (id or file name) to offset_dv_px, offset_du_px, rotation_deg.
+
+    Returns
+    -------
+    dict
+        Keys without a ``.fits`` ending.
+
+    Raises
+    ------
+    ConfigurationError
+        If the file is not of that form.
+    """
+    try:
+        frames = json.loads(path.read_text())["frames"]
+        return {key.removesuffix(".fits"): dict(value) for key, value in frames.items()}
+    except (OSError, ValueError, KeyError, AttributeError, TypeError) as error:
+        raise ConfigurationError(f"{path} is no truth.json: {type(error).__name__}: {error}") from error
+
+
+def compare(table: pd.DataFrame, truth: Mapping[str, Mapping[str, float]]) -> tuple[pd.DataFrame, Agreement]:
+    """Recovered against planted, image by image and together.
+
+    Parameters
+    ----------
+    table
+        Table ``offsets``.
+    truth
+        Of :func:`read_truth`.
+
+    Returns
+    -------
+    tuple
+        Joined table with errors and pulls; figures over all images that have truth.
+    """
+    planted = pd.DataFrame.from_dict(truth, orient="index")[["offset_dv_px", "offset_du_px", "rotation_deg"]]
+    joined = table.merge(planted.add_prefix("planted_"), left_on="image_id", right_index=True, how="inner")
+    for axis in ("dv", "du"):
+        joined[f"error_{axis}_px"] = joined[f"offset_{axis}_px"] - joined[f"planted_offset_{axis}_px"]
+        joined[f"pull_{axis}"] = joined[f"error_{axis}_px"] / joined[f"sigma_{axis}_px"]
+    joined["error_rotation_deg"] = joined["rotation_deg"] - joined["planted_rotation_deg"]
+    good = joined[joined["status"] == "success"].dropna(subset=["pull_dv", "pull_du"])
+    pulls = good[["pull_dv", "pull_du"]].to_numpy()
+    distance = np.hypot(good["error_dv_px"], good["error_du_px"])
+    false = good["image_id"][(np.abs(pulls).max(axis=1, initial=0) > 5) & (distance > 1)]
+    nothing = len(good) == 0
+    agreement = Agreement(
+        len(joined), len(good), math.nan if nothing else float(np.median(distance)),
+        math.nan if nothing else float(np.sqrt(np.mean(pulls**2))),
+        math.nan if nothing else float((np.abs(pulls) <= 2).mean()), tuple(false),
+    )  # fmt: skip
+    return joined, agreement
+
+
+def print_comparison(console: Console, joined: pd.DataFrame, agreement: Agreement, limit: int) -> None:
+    """Table of recovered against planted, and the figures over all.
+
+    Parameters
+    ----------
+    console
+        Terminal.
+    joined, agreement
+        Of :func:`compare`.
+    limit
+        Most rows shown.
+    """
+    table = Table(title="recovered against planted (pixels at the array centre)", title_justify="left")
+    for name in ("image", "outcome", "planted dv, du", "recovered dv, du", "error", "sigma", "rotation planted, found"):
+        table.add_column(name, justify="left" if name in ("image", "outcome") else "right", no_wrap=True)
+    for row in joined.head(limit).itertuples():
+        answered = not math.isnan(row.offset_dv_px)
+        rotation = f"{row.planted_rotation_deg:+.3f}, {row.rotation_deg:+.3f}" if not math.isnan(row.rotation_deg) else ""
+        table.add_row(
+            row.image_id, row.status if row.status == "success" else row.status_reason,
+            f"{row.planted_offset_dv_px:+.2f}, {row.planted_offset_du_px:+.2f}",
+            f"{row.offset_dv_px:+.3f}, {row.offset_du_px:+.3f}" if answered else "",
+            f"{math.hypot(row.error_dv_px, row.error_du_px):.3f}" if answered else "",
+            f"{max(row.sigma_dv_px, row.sigma_du_px):.3f}" if answered else "", rotation,
+        )  # fmt: skip
+    console.print(table)
+    if len(joined) > limit:
+        console.print(f"... and {len(joined) - limit} more")
+    console.print(
+        f"{agreement.answered} of {agreement.images} images answered; median error {agreement.median_error_px:.3f} px; "
+        f"error/sigma rms {agreement.pull_rms:.2f}; within 2 sigma {agreement.within_two_sigma:.1%}; "
+        f"false successes {len(agreement.false_successes)}"
+    )
+
+
+def print_counts(console: Console, table: pd.DataFrame) -> None:
+    """Outcome counts with their reasons.
+
+    Parameters
+    ----------
+    console
+        Terminal.
+    table
+        Table ``offsets``.
+    """
+    counts = table.groupby(["status", "status_reason"], observed=True).size().sort_values(ascending=False)
+    grid = Table(box=None, pad_edge=False)
+    for name in ("status", "reason", "images"):
+        grid.add_column(name, justify="right" if name == "images" else "left")
+    for (status, reason), count in counts.items():
+        grid.add_row(status, reason, str(count))
+    console.print(grid)
+
+
+def print_image(console: Console, document: Mapping[str, Json]) -> None:
+    """One image's answer and what its techniques found.
+
+    Parameters
+    ----------
+    console
+        Terminal.
+    document
+        The image's JSON document.
+    """
+    console.print(f"[bold]{document['image_id']}[/bold]  {document['mission']} {document['camera']}  {document['time_utc']}")
+    console.print(f"{document['status']} ({document['status_reason']}), rank {document['rank']}: {document['detail']}")
+    if isinstance(document["offset_px"], list):
+        console.print(f"offset dv, du {_plain(document['offset_px'])} px, sigma {_plain(document['sigma_px'])} px")
+    if document.get("rotation_deg") is not None:
+        console.print(f"rotation {_plain(document['rotation_deg'])} deg, sigma {_plain(document['sigma_rotation_deg'])} deg")
+    table = Table(box=None, pad_edge=False)
+    for name in ("technique", "outcome", "offset", "sigma", "rotation", "confidence", "used"):
+        table.add_column(name)
+    for technique in _dicts(document["techniques"]):
+        features = technique.get("features")
+        used = sum(map(bool, features["used"])) if isinstance(features, dict) else ""  # type: ignore[arg-type]
+        table.add_row(
+            str(technique["technique"]), str(technique["detail"] or technique["status_reason"]),
+            *(_plain(technique.get(key)) for key in ("offset_px", "sigma_px", "rotation_deg", "confidence")), str(used),
+        )  # fmt: skip
+    console.print(table)
+
+
+def _dicts(value: Json) -> Iterable[dict[str, Json]]:
+    return (entry for entry in value if isinstance(entry, dict)) if isinstance(value, list) else ()
+
+
+def _plain(value: Json) -> str:
+    if isinstance(value, list):
+        return ", ".join(_plain(entry) for entry in value)
+    if isinstance(value, float):
+        return f"{value:.4g}" if abs(value) < 1 else f"{value:.4f}"
+    return "" if value is None else str(value)
+
+
+def progress_of(folder: RunFolder) -> tuple[int, Counter[str], bool]:
+    """State of a run, from its files alone.
+
+    Parameters
+    ----------
+    folder
+        The run, perhaps at work elsewhere.
+
+    Returns
+    -------
+    tuple
+        Images planned; those done by status; whether the run has finished.
+
+    Raises
+    ------
+    ConfigurationError
+        If the folder holds no run.
+    """
+    plan = read_json(folder.plan)
+    if plan is None or not isinstance(plan.get("images"), list):
+        raise ConfigurationError(f"{folder.root} holds no run: it has no plan.json")
+    ids: Sequence[Json] = plan["images"]  # type: ignore[assignment]
+    statuses: Counter[str] = Counter()
+    for image_id in ids:
+        document = read_json(folder.document(str(image_id)))
+        if document is not None and folder.mark(str(image_id)).exists():
+            statuses[str(document["status"])] += 1
+    summary = read_json(folder.root / "run.json")
+    finished = summary is not None and summary.get("plan_digest") == plan.get("digest")
+    return len(ids), statuses, finished

@@ -1,0 +1,226 @@
+"""The run folder: every file is written under a temporary name and renamed, so nothing half-written is ever read."""
+
+import fcntl
+import json
+import os
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from urllib.parse import quote
+from uuid import uuid4
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from pipeline.curate import SCHEMAS, Json, feature_columns, offset_row, technique_rows
+from pipeline.errors import ConfigurationError
+
+# Images whose rows are written together: bounds memory and fixes the row groups whatever the worker count.
+_IMAGES_PER_GROUP = 2000
+_TEMPORARY = re.compile(r"^\.[^/]+\.[0-9a-f]{32}$")
+
+
+@dataclass(frozen=True)
+class RunFolder:
+    """Paths of one run."""
+
+    root: Path
+
+    @property
+    def images(self) -> Path:
+        """JSON documents, one per image."""
+        return self.root / "images"
+
+    @property
+    def state(self) -> Path:
+        """What each image was made from, and its timings: the marks by which a run resumes."""
+        return self.root / "state"
+
+    @property
+    def plan(self) -> Path:
+        """Ids of the images of the latest run."""
+        return self.root / "plan.json"
+
+    def document(self, image_id: str) -> Path:
+        """Document of an image."""
+        return self.images / f"{image_id}.json"
+
+    def mark(self, image_id: str) -> Path:
+        """Mark of an image."""
+        return self.state / f"{image_id}.json"
+
+
+def prepare(folder: RunFolder) -> None:
+    """Make the folders and sweep temporary files that a killed run has left.
+
+    Parameters
+    ----------
+    folder
+        The run.
+
+    Raises
+    ------
+    ConfigurationError
+        If the place cannot be written, or holds something that is no run.
+    """
+    try:
+        if folder.root.is_dir() and not folder.plan.exists() and any(folder.root.iterdir()):
+            strangers = [p.name for p in folder.root.iterdir() if p.name not in (".lock", "images", "state")]
+            if strangers:
+                raise ConfigurationError(f"{folder.root} is not empty and holds no run: {sorted(strangers)[0]}")
+        for path in (folder.images, folder.state):
+            path.mkdir(parents=True, exist_ok=True)
+            for entry in path.iterdir():
+                if _TEMPORARY.match(entry.name):
+                    entry.unlink(missing_ok=True)
+    except OSError as error:
+        raise ConfigurationError(f"cannot write {folder.root}: {error.strerror}") from error
+
+
+@contextmanager
+def exclusive(folder: RunFolder) -> Iterator[None]:
+    """Hold the run's lock; the system lets go of it when the process dies.
+
+    Parameters
+    ----------
+    folder
+        The run, prepared.
+
+    Raises
+    ------
+    ConfigurationError
+        If another process is at work in it.
+    """
+    with (folder.root / ".lock").open("w") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise ConfigurationError(f"another run is at work in {folder.root}") from error
+        yield
+
+
+def write_atomically(path: Path, data: bytes) -> None:
+    """Write a file under a temporary name and rename it.
+
+    Parameters
+    ----------
+    path
+        Final name, in an existing folder.
+    data
+        Content.
+    """
+    temporary = path.with_name(f".{path.name}.{uuid4().hex}")
+    with temporary.open("wb") as file:
+        file.write(data)
+    os.replace(temporary, path)
+
+
+def to_json(content: Mapping[str, Json]) -> bytes:
+    """Canonical bytes of a document: fixed order of keys as built, no not-a-number.
+
+    Parameters
+    ----------
+    content
+        JSON values.
+
+    Returns
+    -------
+    bytes
+        UTF-8, one line per document.
+    """
+    return (json.dumps(content, ensure_ascii=False, allow_nan=False, separators=(",", ":")) + "\n").encode()
+
+
+def read_json(path: Path) -> dict[str, Json] | None:
+    """A JSON object, None where there is none or it cannot be read (then its image is done again).
+
+    Parameters
+    ----------
+    path
+        File.
+
+    Returns
+    -------
+    dict or None
+        Its content.
+    """
+    try:
+        content = json.loads(path.read_bytes())
+    except (FileNotFoundError, ValueError):
+        return None
+    return content if isinstance(content, dict) else None
+
+
+def write_tables(folder: RunFolder, image_ids: Sequence[str]) -> None:
+    """Rebuild all tables from the images' documents, in the order of the ids.
+
+    Parameters
+    ----------
+    folder
+        The run.
+    image_ids
+        Images that belong to it, sorted.
+    """
+    partitions: dict[tuple[str, str], list[str]] = {}
+    for image_id in image_ids:
+        document = read_json(folder.document(image_id))
+        if document is not None:
+            partitions.setdefault((str(document["mission"]), str(document["camera"])), []).append(image_id)
+    for (mission, camera), ids in sorted(partitions.items()):
+        for table in SCHEMAS:
+            _write_partition(folder, table, mission, camera, ids)
+    for table in SCHEMAS:
+        _remove_stale(folder.root / table, {_partition(m, c) for m, c in partitions})
+
+
+def _partition(mission: str, camera: str) -> str:
+    return f"mission={quote(mission, safe='')}/camera={quote(camera, safe='')}"
+
+
+def _write_partition(folder: RunFolder, table: str, mission: str, camera: str, image_ids: Sequence[str]) -> None:
+    """One Parquet file; mission and camera live in its path, as hive partitions do."""
+    names = [name for name in SCHEMAS[table].names if name not in ("mission", "camera")]
+    schema = pa.schema([SCHEMAS[table].field(name) for name in names])
+    target = folder.root / table / _partition(mission, camera) / f"{table}.parquet"
+    target.parent.mkdir(parents=True, exist_ok=True)
+    temporary = target.with_name(f".{target.name}.{uuid4().hex}")
+    with pq.ParquetWriter(temporary, schema, compression="zstd") as writer:
+        for start in range(0, len(image_ids), _IMAGES_PER_GROUP):
+            columns = _columns(folder, table, image_ids[start : start + _IMAGES_PER_GROUP])
+            arrays = [pa.array(columns[name], type=schema.field(name).type) for name in names]
+            writer.write_table(pa.Table.from_arrays(arrays, schema=schema))
+    os.replace(temporary, target)
+
+
+def _columns(folder: RunFolder, table: str, image_ids: Iterable[str]) -> dict[str, list[Json]]:
+    documents = [d for d in (read_json(folder.document(image_id)) for image_id in image_ids) if d is not None]
+    if table == "features":
+        return feature_columns(documents)
+    if table == "offsets":
+        rows = [offset_row(document) for document in documents]
+    elif table == "techniques":
+        rows = [row for document in documents for row in technique_rows(document)]
+    else:
+        rows = [row for document in documents for row in _timing_rows(folder, document)]
+    return {name: [row.get(name) for row in rows] for name in SCHEMAS[table].names}
+
+
+def _timing_rows(folder: RunFolder, document: Mapping[str, Json]) -> list[dict[str, Json]]:
+    mark = read_json(folder.mark(str(document["image_id"])))
+    timings = mark.get("timings") if mark else None
+    if not isinstance(timings, dict):
+        return []
+    return [{"image_id": document["image_id"], "stage": stage, "seconds": s} for stage, s in timings.items()]
+
+
+def _remove_stale(table: Path, wanted: set[str]) -> None:
+    """Drop partitions that no image of this run belongs to any more, and unfinished files."""
+    for path in sorted(table.rglob("*")):
+        inside = path.parent.relative_to(table).as_posix()
+        if path.is_file() and (inside not in wanted or _TEMPORARY.match(path.name)):
+            path.unlink()
+    for path in sorted((p for p in table.rglob("*") if p.is_dir()), reverse=True):
+        if not any(path.iterdir()):
+            path.rmdir()
