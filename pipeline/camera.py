@@ -172,16 +172,23 @@ def _newton(camera: CameraModel, pixels_vu: FloatArray, start_mm: FloatArray) ->
         worst = np.abs(residual).max(axis=1)
         if not (worst > UNPROJECT_TOLERANCE_PX / 10).any():
             break
-        jacobian = _pixel_jacobian(camera, distorted) @ distort_jacobian(camera, photo)
-        determinant = np.linalg.det(jacobian)
-        solvable = np.isfinite(worst) & (np.abs(determinant) > 1e-12 / scale**2)
-        step = np.zeros_like(photo)
-        step[solvable] = np.linalg.solve(jacobian[solvable], residual[solvable][:, :, None])[:, :, 0]
+        step = _solve_2x2(_pixel_jacobian(camera, distorted) @ distort_jacobian(camera, photo), residual, scale)
         photo = np.clip(photo + step, -limit, limit)
     # Beyond a fold of the distortion the residual can vanish at a wrong root, where the model is turned inside out.
-    upright = np.linalg.det(distort_jacobian(camera, photo)) > 0
+    turned = distort_jacobian(camera, photo)
+    upright = turned[:, 0, 0] * turned[:, 1, 1] - turned[:, 0, 1] * turned[:, 1, 0] > 0
     converged = (np.abs(residual) <= UNPROJECT_TOLERANCE_PX).all(axis=1) & upright
     return photo, converged
+
+
+def _solve_2x2(matrix: FloatArray, right: FloatArray, scale: float) -> FloatArray:
+    """Solutions of (n, 2, 2) systems by Cramer's rule; zero where a system is singular or not finite."""
+    (a, b), (c, d) = np.moveaxis(matrix, 0, 2)
+    determinant = a * d - b * c
+    solvable = np.isfinite(right).all(axis=1) & (np.abs(determinant) > 1e-12 / scale**2)
+    divisor = np.where(solvable, determinant, 1.0)
+    step = np.stack([d * right[:, 0] - b * right[:, 1], a * right[:, 1] - c * right[:, 0]], axis=1) / divisor[:, None]
+    return np.asarray(np.where(solvable[:, None], step, 0.0))
 
 
 def unproject_jacobian(camera: CameraModel, pixels_vu: FloatArray) -> FloatArray:

@@ -94,8 +94,9 @@ def smallest_rotation(start: FloatArray, end: FloatArray) -> FloatArray:
     numpy.ndarray
         (3, 3).
     """
-    cross = np.cross(start, end)
-    skew = np.array([[0, -cross[2], cross[1]], [cross[2], 0, -cross[0]], [-cross[1], cross[0], 0]])
+    (a, b, c), (x, y, z) = start, end
+    p, q, r = b * z - c * y, c * x - a * z, a * y - b * x
+    skew = np.array([[0.0, -r, q], [r, 0.0, -p], [-q, p, 0.0]])
     result: FloatArray = np.eye(3) + skew + (skew @ skew) / (1.0 + float(start @ end))
     return result
 

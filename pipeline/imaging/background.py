@@ -20,7 +20,7 @@ class BackgroundOptions(Options):
     """How finely the background is followed."""
 
     tile_px: int = Field(64, ge=8, le=1024, description="side of a tile, pixels")
-    stride_px: int = Field(3, ge=1, le=16, description="spacing of the samples inside a tile, pixels")
+    stride_px: int = Field(4, ge=1, le=16, description="spacing of the samples inside a tile, pixels")
 
 
 @dataclass(frozen=True)

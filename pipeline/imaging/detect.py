@@ -98,15 +98,18 @@ def local_maxima(snr: Image, threshold: float, radius_px: int, count: int) -> Fl
     """
     size = 2 * radius_px + 1
     highest = cv2.dilate(snr, np.ones((size, size), np.uint8))
-    v, u = np.nonzero((snr >= highest) & (snr > threshold))
+    flat = snr.ravel()
+    high = np.flatnonzero(flat > threshold)
+    v, u = np.unravel_index(high[flat[high] >= highest.ravel()[high]], snr.shape)
     # Ties are broken by position so that the order never depends on the sort's internals.
     order = np.lexsort((u, v, -snr[v, u]))[:count]
     v, u = v[order], u[order]
-    padded = np.pad(snr, 1, mode="edge")
-    here = padded[v + 1, u + 1]
+    rows, cols = snr.shape
+    here = snr[v, u]
     position = np.stack([v, u], axis=1).astype(float)
     for axis, (dv, du) in enumerate(((1, 0), (0, 1))):
-        before, after = padded[v + 1 - dv, u + 1 - du], padded[v + 1 + dv, u + 1 + du]
+        before = snr[np.maximum(v - dv, 0), np.maximum(u - du, 0)]
+        after = snr[np.minimum(v + dv, rows - 1), np.minimum(u + du, cols - 1)]
         curve = 2 * here - before - after
         step = np.divide(after - before, 2 * curve, out=np.zeros_like(here), where=curve > 1e-6)
         position[:, axis] += np.clip(step, -0.5, 0.5)
@@ -181,7 +184,7 @@ def _centre_on_saturation(starts_vu: FloatArray, saturated: BoolArray) -> FloatA
     if not len(starts_vu) or not saturated.any():
         return starts_vu
     _, labels, _, centroids = cv2.connectedComponentsWithStats(saturated.astype(np.uint8), connectivity=8)
-    at = np.rint(starts_vu).astype(int)
+    at = np.clip(np.rint(starts_vu).astype(int), 0, np.array(saturated.shape) - 1)
     blob = labels[at[:, 0], at[:, 1]]
     return np.where(blob[:, None] > 0, centroids[blob][:, ::-1], starts_vu)
 

@@ -1,4 +1,4 @@
-"""Which pixels carry no measurement: not finite, never received, saturated."""
+"""Which pixels carry no measurement: never received, saturated."""
 
 import cv2
 import numpy as np
@@ -21,7 +21,7 @@ def missing_pixels(image: Image, missing_value: float | None, level_dn: float, s
     Parameters
     ----------
     image
-        (rows, cols) DN; not-a-number counts as missing.
+        (rows, cols) DN, finite.
     missing_value
         Fill value, None when there is none.
     level_dn, sigma_dn
@@ -32,16 +32,12 @@ def missing_pixels(image: Image, missing_value: float | None, level_dn: float, s
     numpy.ndarray
         (rows, cols) True where missing.
     """
-    missing = ~np.isfinite(image)
-    if missing_value is None:
-        return missing
+    if missing_value is None or not np.isfinite(missing_value):
+        return np.zeros(image.shape, bool)
     equal = image == np.float32(missing_value)
-    share = float(equal.mean())
-    if share == 0.0:
-        return missing
-    if abs(level_dn - missing_value) > _CLEAR_OF_FILL_SIGMA * max(sigma_dn, 1e-6):
-        return missing | equal
-    return missing | _long_runs(equal, _run_length(equal))
+    if not equal.any() or abs(level_dn - missing_value) > _CLEAR_OF_FILL_SIGMA * max(sigma_dn, 1e-6):
+        return equal
+    return _long_runs(equal, _run_length(equal))
 
 
 def _run_length(equal: BoolArray) -> int:

@@ -25,6 +25,9 @@ class StarPredictionOptions(Options):
         "the Hipparcos stars of magnitude 9-10 corresponds to it",
     )
     place_sigma_mas: float = Field(2.0, ge=0, description="floor of a catalogue place's 1-sigma per axis, mas")
+    centroid_floor_px: float = Field(
+        0.003, ge=0, le=1, description="1-sigma per axis of a centroid because no PSF is a Gaussian, pixels"
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,7 +104,8 @@ def predict_stars(stars: StarTable, state: State, frame: Frame, options: StarPre
     order = np.flatnonzero(keep)
     order = order[np.lexsort((stars.star_id[order], stars.mag[order]))][: options.max_stars]
     scale = np.sqrt(np.prod(pixel_scale_rad(state.camera_model)))
-    sigma = np.hypot(place_sigma_rad(stars.take(order), state.et, options) / scale, state.detector.model_residual_px)
+    unmodelled = np.hypot(state.detector.model_residual_px, options.centroid_floor_px)
+    sigma = np.hypot(place_sigma_rad(stars.take(order), state.et, options) / scale, unmodelled)
     return PredictedStars(
         stars.star_id[order], stars.mag[order], directions[order], position[order], sigma, flux[order],
         snr[order],

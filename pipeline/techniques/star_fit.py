@@ -9,14 +9,17 @@ from scipy.stats import chi2 as chi2_distribution
 from pipeline.camera import project
 from pipeline.geometry.pointing import corrected_attitude, move_pivot, offset_between
 from pipeline.geometry.procrustes import kabsch
-from pipeline.geometry.rotations import plane_rotation_derivative
+from pipeline.geometry.rotations import plane_rotation, plane_rotation_derivative
 from pipeline.options import Options
 from pipeline.records import BoolArray, FloatArray
 from pipeline.techniques.base import NavContext
 
 _MEDIAN_CHI2_2DOF = float(chi2_distribution.median(2))
-# Re-prediction with the corrected attitude converges by the square of the field's size: three rounds reach 1e-9 px.
-_ROUNDS = 3
+# Re-prediction with the corrected attitude converges by the square of the field's size: a few rounds settle it.
+_ROUNDS = 5
+_SETTLED_PX = 1e-6
+# Halvings of an interval of ten times the largest residual: a millionth of it is far below any sigma.
+_BISECTIONS = 24
 # With fewer stars a median says nothing of how well the camera model holds.
 _MIN_STARS_FOR_SCATTER = 6
 
@@ -87,22 +90,28 @@ def predict_at(context: NavContext, direction: FloatArray, offset_vu: FloatArray
 
 
 def _solve(
-    context: NavContext, direction: FloatArray, measured_vu: FloatArray, weights: FloatArray
-) -> tuple[FloatArray, float]:
-    """Weighted offset and rotation at the array centre, predictions renewed under each new attitude."""
+    context: NavContext, direction: FloatArray, measured_vu: FloatArray, weights: FloatArray, attitude: FloatArray
+) -> FloatArray:
+    """Attitude that carries the stars onto their measured pixels, predictions renewed under each new attitude."""
     camera, centre = context.camera_model, context.camera_model.centre_vu
-    attitude = context.camera_from_j2000
-    turns = context.fit_camera_rotation and len(direction) > 1
     for _ in range(_ROUNDS):
         predicted = project(camera, direction @ attitude.T)[0]
-        if turns:
-            offset, theta = kabsch(predicted, measured_vu, weights)
-            pivot = weights @ predicted / weights.sum()
-            offset, _ = move_pivot(offset, theta, pivot, centre)
-        else:
-            offset, theta = weights @ (measured_vu - predicted) / weights.sum(), 0.0
+        offset, theta = _similarity(predicted, measured_vu, weights, centre, context.fit_camera_rotation)
         attitude = corrected_attitude(camera, attitude, offset, theta)
-    return offset_between(camera, context.camera_from_j2000, attitude)
+        if np.abs(offset).max() + abs(theta) * max(camera.shape_vu) < _SETTLED_PX:
+            break
+    return attitude
+
+
+def _similarity(
+    predicted_vu: FloatArray, measured_vu: FloatArray, weights: FloatArray, centre_vu: FloatArray, turns: bool
+) -> tuple[FloatArray, float]:
+    """Weighted offset at the array centre, and rotation where it is a parameter and two stars show it."""
+    if not turns or len(weights) < 2:
+        return weights @ (measured_vu - predicted_vu) / weights.sum(), 0.0
+    offset, theta = kabsch(predicted_vu, measured_vu, weights)
+    pivot = weights @ predicted_vu / weights.sum()
+    return move_pivot(offset, theta, pivot, centre_vu)[0], theta
 
 
 def _design(predicted_vu: FloatArray, pivot_vu: FloatArray, rotation_rad: float, size: int) -> FloatArray:
@@ -114,44 +123,55 @@ def _design(predicted_vu: FloatArray, pivot_vu: FloatArray, rotation_rad: float,
     return design
 
 
-def _mahalanobis2(residual_vu: FloatArray, covariance: FloatArray) -> FloatArray:
-    solved = np.linalg.solve(covariance, residual_vu[:, :, None])[:, :, 0]
-    return np.asarray((residual_vu * solved).sum(axis=1))
+class _Spread:
+    """Residuals in the axes of their own covariances, where adding an isotropic scatter is one sum."""
 
+    def __init__(self, residual_vu: FloatArray, covariance: FloatArray) -> None:
+        self._variance, axes = np.linalg.eigh(covariance)
+        self._square = np.einsum("nij,ni->nj", axes, residual_vu) ** 2
 
-def _scatter(residual_vu: FloatArray, covariance: FloatArray, target: float, use_median: bool) -> float:
-    """Per-axis sigma to add so that the median (or the sum) of the squared distances meets its target."""
+    def distance2(self, extra_sigma: float) -> FloatArray:
+        """(n,) squared Mahalanobis distances with a scatter added."""
+        return np.asarray((self._square / (self._variance + extra_sigma**2)).sum(axis=1))
 
-    def excess(extra: float) -> float:
-        distance2 = _mahalanobis2(residual_vu, covariance + extra**2 * np.eye(2))
-        return float(np.median(distance2) if use_median else distance2.sum()) - target
+    def scatter(self, target: float, use_median: bool) -> float:
+        """Per-axis sigma to add so that the median (or the sum) of the squared distances meets its target."""
 
-    if excess(0.0) <= 0:
-        return 0.0
-    low, high = 0.0, float(np.abs(residual_vu).max()) * 10.0 + 1e-9
-    for _ in range(40):
-        middle = (low + high) / 2
-        low, high = (middle, high) if excess(middle) > 0 else (low, middle)
-    return high
+        def excess(extra: float) -> float:
+            distance2 = self.distance2(extra)
+            return float(np.median(distance2) if use_median else distance2.sum()) - target
+
+        if excess(0.0) <= 0:
+            return 0.0
+        low, high = 0.0, 10.0 * float(np.sqrt(self._square.max())) + 1e-9
+        for _ in range(_BISECTIONS):
+            middle = (low + high) / 2
+            low, high = (middle, high) if excess(middle) > 0 else (low, middle)
+        return high
 
 
 def _reject(
-    context: NavContext, direction: FloatArray, measured_vu: FloatArray, covariance: FloatArray, options: StarFitOptions
+    context: NavContext, predicted_vu: FloatArray, measured_vu: FloatArray, covariance: FloatArray, options: StarFitOptions
 ) -> BoolArray:
-    """Drop the worst star, one at a time, until none is an outlier or too few would remain to tell."""
-    inlier = np.ones(len(direction), bool)
+    """Drop the worst star, one at a time, until none is an outlier or too few would remain to tell.
+
+    ``predicted_vu`` is under an attitude close to the answer, so that a similarity in the image plane is exact enough.
+    """
+    inlier = np.ones(len(predicted_vu), bool)
     limit = float(chi2_distribution.isf(options.outlier_chance, 2))
-    fewest = 3 if context.fit_camera_rotation else 2
-    while inlier.sum() > fewest:
-        weights = _weights(covariance[inlier] + options.model_floor_px**2 * np.eye(2))
-        offset, theta = _solve(context, direction[inlier], measured_vu[inlier], weights)
-        residual = measured_vu[inlier] - predict_at(context, direction[inlier], offset, theta)
+    turns, centre = context.fit_camera_rotation, context.camera_model.centre_vu
+    weights = _weights(covariance + options.model_floor_px**2 * np.eye(2))
+    while inlier.sum() > (3 if turns else 2):
+        offset, theta = _similarity(predicted_vu[inlier], measured_vu[inlier], weights[inlier], centre, turns)
+        fitted = (predicted_vu[inlier] - centre) @ plane_rotation(theta).T + centre + offset
+        spread = _Spread(measured_vu[inlier] - fitted, covariance[inlier])
         extra = options.model_floor_px
         if inlier.sum() >= _MIN_STARS_FOR_SCATTER:
-            extra = max(extra, _scatter(residual, covariance[inlier], _MEDIAN_CHI2_2DOF, use_median=True))
-        # A star's own pull shrinks its residual: what is left of its variance is one minus its share of the weight.
-        share = np.clip(1.0 - weights / weights.sum() * (1.5 if context.fit_camera_rotation else 1.0), 0.1, 1.0)
-        distance2 = _mahalanobis2(residual, covariance[inlier] + extra**2 * np.eye(2)) / share
+            extra = max(extra, spread.scatter(_MEDIAN_CHI2_2DOF, use_median=True))
+        # A star's own pull shrinks its residual: what is left of its variance is one minus its share of the weight,
+        # and of the rotation's, which makes three parameters out of two.
+        share = weights[inlier] / weights[inlier].sum() * (1.5 if turns else 1.0)
+        distance2 = spread.distance2(extra) / np.clip(1.0 - share, 0.1, 1.0)
         worst = int(np.argmax(distance2))
         if distance2[worst] <= limit:
             break
@@ -197,21 +217,25 @@ def fit_stars(
     StarFit
         With one star, or without a rotation parameter, theta is zero; with one star its information is zero.
     """
-    inlier = _reject(context, direction, measured_vu, covariance_vu, options)
+    camera, prior = context.camera_model, context.camera_from_j2000
+    attitude = _solve(context, direction, measured_vu, _weights(covariance_vu + options.model_floor_px**2 * np.eye(2)), prior)
+    near = project(camera, direction @ attitude.T)[0]
+    inlier = _reject(context, near, measured_vu, covariance_vu, options)
     size = 3 if context.fit_camera_rotation else 2
     free = size if inlier.sum() > 1 else 2
     extra = 0.0
     for _ in range(2):
-        total = covariance_vu[inlier] + extra**2 * np.eye(2)
-        weights = _weights(total)
-        offset, theta = _solve(context, direction[inlier], measured_vu[inlier], weights)
-        residual = measured_vu - predict_at(context, direction, offset, theta)
+        weights = _weights(covariance_vu[inlier] + extra**2 * np.eye(2))
+        attitude = _solve(context, direction[inlier], measured_vu[inlier], weights, attitude)
+        residual = measured_vu - project(camera, direction @ attitude.T)[0]
         extra = _extra_sigma(residual[inlier], covariance_vu[inlier], 2 * int(inlier.sum()) - free, options)
+        if extra == 0.0:
+            break
+    offset, theta = offset_between(camera, prior, attitude)
     total = covariance_vu[inlier] + extra**2 * np.eye(2)
     pivot = weights @ predicted_vu[inlier] / weights.sum()
-    about_pivot, _ = move_pivot(offset, theta, context.camera_model.centre_vu, pivot)
-    design = _design(predicted_vu[inlier], pivot, theta, free)
-    covariance = _sandwich(design, weights, total)
+    about_pivot, _ = move_pivot(offset, theta, camera.centre_vu, pivot)
+    covariance = _sandwich(_design(predicted_vu[inlier], pivot, theta, free), weights, total)
     information = np.zeros((size, size))
     information[:free, :free] = np.linalg.inv(covariance)
     return StarFit(about_pivot, theta, information, pivot, offset, residual, inlier, extra)
@@ -221,9 +245,10 @@ def _extra_sigma(residual_vu: FloatArray, covariance: FloatArray, dof: int, opti
     """Scatter that the residuals ask for beyond the stated sigmas (DerSimonian and Laird's idea, shrunk)."""
     if dof < 1:
         return 0.0
-    chi2 = float(_mahalanobis2(residual_vu, covariance).sum())
+    spread = _Spread(residual_vu, covariance)
+    chi2 = float(spread.distance2(0.0).sum())
     factor = (options.prior_dof + chi2) / (options.prior_dof + dof)
-    return _scatter(residual_vu, covariance, chi2 / factor, use_median=False) if factor > 1.0 else 0.0
+    return spread.scatter(chi2 / factor, use_median=False) if factor > 1.0 else 0.0
 
 
 def _sandwich(design: FloatArray, weights: FloatArray, covariance: FloatArray) -> FloatArray:

@@ -8,6 +8,7 @@ from pydantic import Field
 from pipeline.geometry.procrustes import pair_rotation
 from pipeline.imaging.psf import PointSources
 from pipeline.predict.stars import PredictedStars
+from pipeline.records import FloatArray
 from pipeline.status import StatusReason
 from pipeline.techniques.base import NavContext, TechniqueFailure, TechniqueOptions, TechniqueResult, edge_flags
 from pipeline.techniques.star_field import pair_covariance
@@ -26,6 +27,7 @@ from pipeline.techniques.star_match import (
     posterior,
     same_answer,
     similarity,
+    transform,
 )
 
 NAME = "StarUniqueMatchNav"
@@ -38,7 +40,7 @@ class StarUniqueOptions(TechniqueOptions):
     fit: StarFitOptions = StarFitOptions()
     brightest: int = Field(4, ge=1, le=20, description="brightest predicted stars tried")
     max_sources: int = Field(60, ge=1, le=500, description="brightest detections tried")
-    separation_px: float = Field(1.5, gt=0, le=20, description="largest error of a pair's separation, pixels")
+    separation_px: float = Field(1.0, gt=0, le=20, description="largest error of a pair's separation, pixels")
     min_probability_pair: float = Field(0.999, gt=0.5, lt=1, description="posterior probability asked of two stars")
     min_probability_single: float = Field(0.98, gt=0.5, lt=1, description="posterior probability asked of one star")
 
@@ -122,17 +124,30 @@ def _pair_hypothesis(
 
 
 def _singles(problem: MatchProblem, ratio: np.ndarray, options: StarUniqueOptions) -> list[Hypothesis]:
-    """The brightest star on every detection within the margin."""
+    """The brightest star on every detection within the margin where it is the only star to be expected.
+
+    A second star in the field makes a lone match either a pair or a sign that something is wrong (the star has a
+    companion, or is not where the catalogue puts it), and one star cannot tell which.
+    """
     found: list[Hypothesis] = []
     star = np.array([0])
     for j in range(len(problem.measured_vu)):
         source = np.array([j])
         offset, _ = similarity(problem, star, source)
+        if _others_expected(problem, offset):
+            continue
         log_odds = assignment_log_odds(problem, ratio, star, source, offset, 0.0, options.match, considered=star)
         if np.isfinite(log_odds):
             found.append(Hypothesis(star, source, offset, 0.0, log_odds))
     found.sort(key=lambda h: -h.log_odds)
     return found
+
+
+def _others_expected(problem: MatchProblem, offset_vu: FloatArray) -> bool:
+    """Whether a second bright star should be on the array under this offset, at any rotation near zero."""
+    seen = transform(problem, offset_vu, 0.0)[1:]
+    inside = ((seen > -0.5) & (seen < np.array(problem.shape_vu) - 0.5)).all(axis=1)
+    return bool((inside & (problem.chance_detected[1:] > 0.5)).any())
 
 
 def _distinct(found: list[Hypothesis], problem: MatchProblem) -> list[Hypothesis]:

@@ -228,14 +228,15 @@ def test_truth_against_files_read_anew(archive: Path, sky: RealSky) -> None:
         true = Rotation.from_quat([*wxyz[1:], wxyz[0]]).as_matrix()
         pixels = mine[["v_px", "u_px"]].to_numpy()
         # The day of the sidecar's time is cut off here: 0.003 years of 0.7 arcsec a year is 0.002 px.
-        assert np.abs(_tangent_plane_pixels(camera, true, directions) - pixels).max() < 0.01
+        slack = 5.0 * camera.image_error_px
+        assert np.abs(_tangent_plane_pixels(camera, true, directions) - pixels).max() < 0.01 + slack
         predicted = _tangent_plane_pixels(camera, attitude, directions)
         angle = np.radians(entry["rotation_deg"])
         turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
         offset = np.array([entry["offset_dv_px"], entry["offset_du_px"]])
         actual = camera.centre_vu + (predicted - camera.centre_vu) @ turn.T + offset
         # A tilt is not quite a shift far from the centre: up to half a pixel in the wide camera or a bent one.
-        assert np.abs(actual - pixels).max() < 0.7
+        assert np.abs(actual - pixels).max() < 0.7 + slack
 
 
 def test_offsets_stay_inside_the_margin(archive: Path) -> None:
@@ -304,9 +305,10 @@ def test_flux_at_limit_is_five_sigma(name: str) -> None:
 def test_light_in_the_frames_adds_up(archive: Path) -> None:
     """Aperture sums of lone stars scatter about the true flux as their noise says."""
     rows = pd.read_parquet(archive / "truth_stars.parquet")
+    truth = json.loads((archive / "truth.json").read_text())["frames"]
     pulls: list[float] = []
     for image_id, mine in rows.groupby("image_id"):
-        camera = next(camera for camera in CAMERAS.values() if str(image_id).endswith(camera.name))
+        camera = CAMERAS[truth[str(image_id)]["camera"]]
         image = fits.getdata(archive / "frames" / f"{image_id}.fits").astype(np.float64)
         good = image[image > 0] if camera.missing_value is not None else image
         background = float(np.median(good)) if camera.is_lorri else float(good[good < np.percentile(good, 99)].mean())
@@ -332,8 +334,9 @@ def test_light_in_the_frames_adds_up(archive: Path) -> None:
 
 
 def test_frames_are_stored_as_their_missions_do(archive: Path) -> None:
+    truth = json.loads((archive / "truth.json").read_text())["frames"]
     for path in sorted((archive / "frames").glob("*.fits")):
-        camera = next(camera for camera in CAMERAS.values() if path.stem.endswith(camera.name))
+        camera = CAMERAS[truth[path.stem]["camera"]]
         with fits.open(path) as units:
             image = units[0].data
             assert image.shape == camera.shape_vu

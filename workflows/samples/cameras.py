@@ -29,6 +29,9 @@ class SampleCamera:
         Owen's e1..e6 for coordinates in mm.
     psf_sigma_px
         Sigma of the Gaussian star image, before integration over the pixel.
+    image_error_px
+        Sigma per axis by which star images miss the pixel that the ideal camera gives them: distortion and shape of
+        the PSF that nobody has calibrated. Zero where the sidecar's camera is the whole truth.
     read_noise_dn
         Sigma of all noise that does not depend on light, the rounding to integers included.
     saturation_dn
@@ -65,6 +68,7 @@ class SampleCamera:
     fit_camera_rotation: bool
     exposures_s: tuple[float, ...]
     faint_mags: tuple[float, ...]
+    image_error_px: float
     years: tuple[float, float]
     distance_au: tuple[float, float]
     speed_kms: tuple[float, float]

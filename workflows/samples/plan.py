@@ -38,6 +38,10 @@ OFFSET_SHARE = 0.9
 OBLIQUITY_RAD = np.radians(23.4393)
 
 
+MET_OF_ET_S = 190_966_152.0
+"""ET minus the mission elapsed time of New Horizons, s, to within a second, from the level 2 headers."""
+
+
 @dataclass(frozen=True)
 class FramePlan:
     """All that decides one frame, small enough to send to a worker.
@@ -72,6 +76,10 @@ class FramePlan:
     @property
     def image_id(self) -> str:
         """Name of the frame and stem of its files."""
+        if self.camera.is_lorri:
+            # A LORRI product's name: mission elapsed time, application, and here the frame's number.
+            apid = "0x633" if self.camera.name.endswith("4x4") else "0x631"
+            return f"lor_{round(self.et - MET_OF_ET_S):010d}_{apid}_s{self.index:04d}"
         return f"star_{self.index:04d}_{self.camera.name}"
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from zlib import crc32
 
 import numpy as np
@@ -157,6 +157,7 @@ def compose(plan: FramePlan, rng: np.random.Generator) -> tuple[Sources, Sources
     """
     stars = catalogue_sources(plan)
     seen = is_detectable(plan.camera, stars)
+    stars = replace(stars, vu=stars.vu + plan.camera.image_error_px * rng.standard_normal(stars.vu.shape))
     counts = count_false(int(seen.sum()), plan.false_fraction, rng)
     odd = make_odd(stars, seen, plan.oddity_fraction, rng)
     shining = join_sources([odd, confusers(plan, stars.flux_dn[seen], counts["confuser"], rng)])

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from workflows.samples.attitude import LORRI_CAMERA_FROM_INSTRUMENT, wxyz_from_matrix
 from workflows.samples.camera_table import PHOTZPT_1X1, PHOTZPT_4X4
 from workflows.samples.cameras import FloatArray, SampleCamera
-from workflows.samples.plan import FramePlan, inside
+from workflows.samples.plan import MET_OF_ET_S, FramePlan, inside
 from workflows.samples.render import add_stars, expose, lose_lines, sky_background
 from workflows.samples.scene import Sources, catalogue_sources, compose, is_detectable, join_sources
 from workflows.samples.sky import AU_KM
@@ -24,8 +24,6 @@ JsonValue = str | int | float | bool | None | list["JsonValue"] | Json
 TruthColumns = dict[str, list[str] | list[float] | list[bool]]
 
 CATALOGUE_KINDS = ("catalogue", "moved", "variable", "double")
-MET_OF_ET_S = 190_966_152.0
-"""ET minus the mission elapsed time of New Horizons, s, to within a second, from the level 2 headers."""
 LORRI_HEADER_PIXELS = 34
 """The first pixels of a LORRI frame carry its header instead of light; level 2 flags them."""
 LORRI_HEADER_FLAG = 32
