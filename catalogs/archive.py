@@ -133,7 +133,10 @@ def file_stamp(url: str, path: str) -> tuple[int, str] | None:
         info = fs.info(full)
     except FileNotFoundError:
         return None
-    mark = next((info[key] for key in ("ETag", "etag", "mtime", "last_modified", "LastModified", "created") if info.get(key)), "")
+    mark = next(
+        (info[key] for key in ("ETag", "etag", "mtime", "last_modified", "LastModified", "created") if info.get(key)),
+        "",
+    )
     return int(info.get("size") or 0), str(mark)
 
 

@@ -257,9 +257,7 @@ def identify(header: Mapping[str, CardValue], blocks: Mapping[str, InstrumentBlo
     return None
 
 
-def state_from_header(
-    raw: RawImage, image_id: str, block: InstrumentBlock, overrides: Mapping[str, object]
-) -> State:
+def state_from_header(raw: RawImage, image_id: str, block: InstrumentBlock, overrides: Mapping[str, object]) -> State:
     """State from the pointing cards of the product itself.
 
     Parameters
@@ -284,7 +282,9 @@ def state_from_header(
         If the camera has no header reader, or a card is missing or unknown.
     """
     if block.header != "lorri":
-        raise GeometryError(StatusReason.GEOMETRY_MISSING, f"headers of {block.mission} {block.camera} carry no pointing")
+        raise GeometryError(
+            StatusReason.GEOMETRY_MISSING, f"headers of {block.mission} {block.camera} carry no pointing"
+        )
     try:
         return _state_from_lorri(raw, image_id, block, overrides)
     except ContractError as error:
@@ -296,7 +296,9 @@ def _state_from_lorri(raw: RawImage, image_id: str, block: InstrumentBlock, over
     mode = _lorri_mode(header, block)
     quaternion = _numbers(header, "SPCQA", "SPCQX", "SPCQY", "SPCQZ")
     if quaternion is None or abs(np.linalg.norm(quaternion) - 1.0) > 1e-3:
-        raise GeometryError(StatusReason.GEOMETRY_MISSING, "header has no attitude quaternion (SPCQA, SPCQX, SPCQY, SPCQZ)")
+        raise GeometryError(
+            StatusReason.GEOMETRY_MISSING, "header has no attitude quaternion (SPCQA, SPCQX, SPCQY, SPCQZ)"
+        )
     # SPICE's quaternion maps instrument vectors to J2000.
     attitude = _CAMERA_FROM_LORRI @ matrix_from_quaternion(quaternion).T
     rate = _numbers(header, "RATEX", "RATEY", "RATEZ")

@@ -1,8 +1,9 @@
 """Image files: bytes to pixels, header and the product's own bad-pixel flags."""
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from io import BytesIO
 
 import numpy as np
@@ -29,12 +30,12 @@ class RawImage:
     header
         Cards of the image's header.
     extensions
-        Further two-dimensional images of the same shape, by name.
+        Readers of the file's further two-dimensional images, by name in upper case.
     """
 
     pixels: Image
     header: Mapping[str, CardValue]
-    extensions: Mapping[str, Image]
+    extensions: Mapping[str, Callable[[], Image]]
 
 
 def read_image(data: bytes, name: str) -> RawImage:
@@ -74,22 +75,23 @@ def read_image(data: bytes, name: str) -> RawImage:
 
 
 def _read_fits(data: bytes, name: str) -> RawImage:
-    with fits.open(BytesIO(data), memmap=False, lazy_load_hdus=True) as hdus:
-        first = next((hdu for hdu in hdus if hdu.header.get("NAXIS", 0) >= 2 and hdu.is_image), None)
-        if first is None:
-            if len(data) % _BLOCK or len(data) <= _BLOCK:
-                raise ImageError(StatusReason.IMAGE_TRUNCATED, f"{name} ends inside its header")
-            raise ImageError(StatusReason.IMAGE_UNREADABLE, f"{name} holds no two-dimensional image")
-        for hdu in hdus:
-            _check_length(hdu, len(data), name)
-        pixels = _native(np.squeeze(first.data))
-        extensions = {
-            hdu.name: _native(hdu.data)
-            for hdu in hdus
-            if hdu is not first and hdu.is_image and hdu.header.get("NAXIS") == 2 and hdu.name
-        }
+    hdus = fits.open(BytesIO(data), memmap=False, lazy_load_hdus=True)
+    first = next((hdu for hdu in hdus if hdu.is_image and hdu.header.get("NAXIS", 0) >= 2), None)
+    if first is None:
+        if len(data) % _BLOCK or len(data) <= _BLOCK:
+            raise ImageError(StatusReason.IMAGE_TRUNCATED, f"{name} ends inside its header")
+        raise ImageError(StatusReason.IMAGE_UNREADABLE, f"{name} holds no two-dimensional image")
+    for hdu in hdus:
+        _check_length(hdu, len(data), name)
+    extensions = {
+        hdu.name.upper(): partial(_pixels_of, hdu) for hdu in hdus if hdu is not first and hdu.is_image and hdu.name
+    }
     # astropy parses a card when it is asked for; a product's few hundred others stay text.
-    return RawImage(pixels, first.header, extensions)
+    return RawImage(_pixels_of(first), first.header, extensions)
+
+
+def _pixels_of(hdu: fits.PrimaryHDU) -> Image:
+    return _native(np.squeeze(hdu.data))
 
 
 def _check_length(hdu: fits.PrimaryHDU, length: int, name: str) -> None:
@@ -106,7 +108,7 @@ def _data_bytes(header: fits.Header) -> int:
     if not axes:
         return 0
     elements = int(np.prod(axes, dtype=np.int64))
-    return abs(header["BITPIX"]) // 8 * header.get("GCOUNT", 1) * (header.get("PCOUNT", 0) + elements)
+    return int(abs(header["BITPIX"]) // 8 * header.get("GCOUNT", 1) * (header.get("PCOUNT", 0) + elements))
 
 
 def _native(array: Image) -> Image:

@@ -23,7 +23,7 @@ from pipeline.geometry.astrometry import (
 from pipeline.records import FloatArray, Spacecraft, StarTable
 
 # Raised whenever the layout or the way a built-in catalogue is read changes: old index files are then left alone.
-INDEX_VERSION = 1
+INDEX_VERSION = 2
 _ZONE_DEG = 0.5
 _ZONES = int(180 / _ZONE_DEG)
 # Fastest star (Barnard) and nearest star (Proxima): how far a place may be from where the star is seen.
@@ -77,7 +77,8 @@ class StarIndex:
         rows = np.concatenate(found)
         near = unit_vectors(rows["ra_deg"], rows["dec_deg"]) @ axis >= np.cos(half_angle_rad) - 1e-15
         rows = rows[near]
-        return StarTable(rows["star_id"], *(rows[name] for name in _FLOATS), rows["apparent"])
+        columns = {name: rows[name] for name in ("star_id", *_FLOATS, "apparent")}
+        return StarTable(**columns)
 
     def _ranges(self, axis: FloatArray, half_angle_rad: float) -> list[tuple[int, int]]:
         """Row ranges that hold the cone: per zone one window of right ascension, two across 0 h."""
@@ -87,7 +88,9 @@ class StarIndex:
         low, high = max(dec - half, -90.0), min(dec + half, 90.0)
         # Width in right ascension of a cone that does not touch a pole.
         widest = max(abs(dec - half), abs(dec + half))
-        reach = 180.0 if widest >= 90 else float(np.degrees(np.arcsin(np.sin(np.radians(half)) / np.cos(np.radians(dec)))))
+        reach = (
+            180.0 if widest >= 90 else float(np.degrees(np.arcsin(np.sin(np.radians(half)) / np.cos(np.radians(dec)))))
+        )
         ranges = []
         for zone in range(_zone(low), _zone(high) + 1):
             start, stop = int(self.zone_start[zone]), int(self.zone_start[zone + 1])
@@ -249,7 +252,9 @@ def added_index(name: str, folder: Path) -> Path | None:
     return folder / str(json.loads(link.read_text())["file"])
 
 
-def seen_from(indexes: Sequence[StarIndex], axis: FloatArray, half_angle_rad: float, et: float, spacecraft: Spacecraft) -> StarTable:
+def seen_from(
+    indexes: Sequence[StarIndex], axis: FloatArray, half_angle_rad: float, et: float, spacecraft: Spacecraft
+) -> StarTable:
     """Catalogue stars that a spacecraft may see in a cone at an instant.
 
     The cone is widened by what the fastest star moves from the oldest epoch, by the nearest star's parallax at the

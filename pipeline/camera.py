@@ -68,7 +68,7 @@ def distort_jacobian(camera: CameraModel, photo_mm: FloatArray) -> FloatArray:
     jacobian[:, 1, 1] += scale
     jacobian[:, 0, 1] -= swirl
     jacobian[:, 1, 0] += swirl
-    return jacobian
+    return np.asarray(jacobian)
 
 
 def _pixel_from_photo(camera: CameraModel, distorted_mm: FloatArray) -> FloatArray:
@@ -150,8 +150,8 @@ def unproject(camera: CameraModel, pixels_vu: FloatArray) -> tuple[FloatArray, B
     """
     pixels_vu = np.asarray(pixels_vu, dtype=float)
     centred = (pixels_vu - camera.principal_point_vu)[:, ::-1]
-    photo = centred @ np.linalg.inv(camera.k_px_per_mm).T
-    ok = np.isfinite(photo).all(axis=1)
+    photo: FloatArray = centred @ np.linalg.inv(camera.k_px_per_mm).T
+    ok: BoolArray = np.asarray(np.isfinite(photo).all(axis=1))
     if camera.distortion_eps.any() or camera.k_xy_px_per_mm2.any():
         photo, ok = _newton(camera, pixels_vu, photo)
     rays = np.concatenate([photo, np.full((len(photo), 1), camera.focal_length_mm)], axis=1)
@@ -178,7 +178,7 @@ def _newton(camera: CameraModel, pixels_vu: FloatArray, start_mm: FloatArray) ->
     turned = distort_jacobian(camera, photo)
     upright = turned[:, 0, 0] * turned[:, 1, 1] - turned[:, 0, 1] * turned[:, 1, 0] > 0
     converged = (np.abs(residual) <= UNPROJECT_TOLERANCE_PX).all(axis=1) & upright
-    return photo, converged
+    return photo, np.asarray(converged)
 
 
 def _solve_2x2(matrix: FloatArray, right: FloatArray, scale: float) -> FloatArray:

@@ -95,9 +95,8 @@ def build_metadata_dict(navigation: Navigation, options: RankOptions, provenance
     document |= _answer(estimate, state)
     document["pointing"] = _pointing(estimate, state, navigation.reason)
     document["frame"] = None if navigation.frame is None else _frame_figures(navigation.frame)
-    document["techniques"] = [_technique(result, estimate) for result in navigation.results] + [
-        _failure(failure) for failure in navigation.failures
-    ]
+    answers: list[Json] = [_technique(result, estimate) for result in navigation.results]
+    document["techniques"] = [*answers, *(_failure(failure) for failure in navigation.failures)]
     document["provenance"] = _provenance(provenance)
     return document
 
@@ -180,11 +179,10 @@ def _answer(estimate: _CombinedEstimate | None, state: State) -> dict[str, Json]
             "covariance_px2": _numbers(estimate.covariance[:2, :2]), "observable": None,
         }  # fmt: skip
     if state.settings.fit_camera_rotation:
-        seen = estimate is not None and estimate.rotation_rad is not None
-        answer["rotation_deg"] = float(np.degrees(estimate.rotation_rad)) if seen and estimate else None
-        answer["sigma_rotation_deg"] = (
-            float(np.degrees(np.sqrt(estimate.covariance[2, 2]))) if seen and estimate else None
-        )
+        answer["rotation_deg"] = answer["sigma_rotation_deg"] = None
+        if estimate is not None and estimate.rotation_rad is not None:
+            answer["rotation_deg"] = float(np.degrees(estimate.rotation_rad))
+            answer["sigma_rotation_deg"] = float(np.degrees(np.sqrt(estimate.covariance[2, 2])))
     return answer
 
 
@@ -354,7 +352,9 @@ def _identity(document: Mapping[str, Json]) -> Row:
 
 def _used(technique: Mapping[str, Json]) -> int | None:
     features = technique.get("features")
-    return sum(map(bool, features["used"])) if isinstance(features, dict) and isinstance(features["used"], list) else None
+    return (
+        sum(map(bool, features["used"])) if isinstance(features, dict) and isinstance(features["used"], list) else None
+    )
 
 
 def offset_row(document: Mapping[str, Json]) -> Row:
@@ -378,7 +378,9 @@ def offset_row(document: Mapping[str, Json]) -> Row:
     row["offset_dv_px"], row["offset_du_px"] = _pair(document["offset_px"])
     row["sigma_dv_px"], row["sigma_du_px"] = _pair(document["sigma_px"])
     covariance = document["covariance_px2"]
-    row["cov_dv_du_px2"] = covariance[0][1] if isinstance(covariance, list) and isinstance(covariance[0], list) else None
+    row["cov_dv_du_px2"] = (
+        covariance[0][1] if isinstance(covariance, list) and isinstance(covariance[0], list) else None
+    )
     row["rotation_deg"], row["sigma_rotation_deg"] = document.get("rotation_deg"), document.get("sigma_rotation_deg")
     observable = document["observable"]
     if isinstance(observable, dict):

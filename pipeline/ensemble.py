@@ -6,7 +6,7 @@ pseudo-inverse compares like with like.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from pydantic import Field
@@ -194,18 +194,22 @@ def _independent(cluster: list[_Placed]) -> list[_Placed]:
     return kept
 
 
-def _informativeness(placed: _Placed) -> tuple[int, float]:
-    """Rank first, then the log-determinant over the observed subspace."""
+def _informativeness(placed: _Placed) -> tuple[int, int, float]:
+    """Observed directions first, then measurements, then the log-determinant over the observed subspace.
+
+    Measurements come before the determinant: among answers from the same pixels, the one with the smallest stated
+    sigma is too often the one whose sigma is too small by chance.
+    """
     values = np.linalg.eigvalsh(placed.information)
     seen = values[values > _NULL * max(values.max(), 1e-300)]
-    return len(seen), float(np.log(seen).sum())
+    return len(seen), placed.result.measurements, float(np.log(seen).sum())
 
 
 def _strength(cluster: list[_Placed]) -> tuple[float, int, float]:
     """Surest independent witnesses first; ties go to the larger, then the more informative cluster."""
     members = _independent(cluster)
     doubt = sum(-np.log(max(1.0 - m.result.confidence, 1e-12)) for m in members)
-    return float(doubt), len(cluster), max(_informativeness(m)[1] for m in members)
+    return float(doubt), len(cluster), max(_informativeness(m)[2] for m in members)
 
 
 def _reason(best: list[_Placed], clusters: list[list[_Placed]], options: EnsembleOptions) -> StatusReason:
@@ -237,25 +241,32 @@ def _combine(
     covariance = pinvh(information, rtol=_NULL)
     state = covariance @ pull
     null_vu = _null_direction(information)
-    common = {
-        "fitted_rotation": turns, "confidence": max(p.result.confidence for p in cluster),
-        "members": tuple(m.result.technique for m in members), "excluded": excluded,
-    }  # fmt: skip
+    blank = _CombinedEstimate(
+        offset_vu=state[:2], rotation_rad=None, covariance=np.full((2, 2), np.nan), fitted_rotation=turns,
+        observable_vu=None, along_px=None, sigma_along_px=None, confidence=max(p.result.confidence for p in cluster),
+        members=tuple(m.result.technique for m in members), excluded=excluded, reason=reason,
+    )  # fmt: skip
     if null_vu is not None:
-        along = np.array([-null_vu[1], null_vu[0]])
-        along = along if (along[np.argmax(np.abs(along))] > 0) else -along
-        return _CombinedEstimate(
-            offset_vu=along * float(along @ state[:2]), rotation_rad=None, covariance=np.full((2, 2), np.nan),
-            observable_vu=along, along_px=float(along @ state[:2]),
-            sigma_along_px=float(np.sqrt(along @ covariance[:2, :2] @ along)),
-            reason=StatusReason.NAVIGATED_ONE_DIRECTION if reason is StatusReason.NAVIGATED else reason, **common,
-        )  # fmt: skip
+        return _one_direction(blank, null_vu, state[:2], covariance[:2, :2])
     size = 3 if observed else 2
     scale = np.diag([1.0, 1.0, 1.0 / arm])[:size, :size]
-    return _CombinedEstimate(
-        offset_vu=state[:2], rotation_rad=float(state[2] / arm) if observed else None,
-        covariance=scale @ covariance[:size, :size] @ scale, observable_vu=None, along_px=None, sigma_along_px=None,
-        reason=reason, **common,
+    return replace(
+        blank, rotation_rad=float(state[2] / arm) if observed else None,
+        covariance=scale @ covariance[:size, :size] @ scale,
+    )  # fmt: skip
+
+
+def _one_direction(
+    blank: _CombinedEstimate, null_vu: FloatArray, offset_vu: FloatArray, covariance: FloatArray
+) -> _CombinedEstimate:
+    """Answer along the only direction that is known: the one across the null direction."""
+    along = np.array([-null_vu[1], null_vu[0]])
+    along = along if along[np.argmax(np.abs(along))] > 0 else -along
+    reason = blank.reason
+    return replace(
+        blank, offset_vu=along * float(along @ offset_vu), observable_vu=along, along_px=float(along @ offset_vu),
+        sigma_along_px=float(np.sqrt(along @ covariance @ along)),
+        reason=StatusReason.NAVIGATED_ONE_DIRECTION if reason is StatusReason.NAVIGATED else reason,
     )  # fmt: skip
 
 

@@ -14,6 +14,7 @@ from pipeline.options import Options
 from pipeline.records import BoolArray, CameraModel, Detector, FloatArray, Image, State
 from pipeline.status import StatusReason
 
+_EIGHT_BIT_MAX = 255
 # An ideal quantiser adds a twelfth of its step squared to the variance.
 _QUANTISATION_SIGMA = 1.0 / np.sqrt(12.0)
 
@@ -22,10 +23,14 @@ class FrameOptions(Options):
     """Limits of the image classifier and the noise model's defaults."""
 
     background: BackgroundOptions = BackgroundOptions()
-    max_missing_share: float = Field(0.6, gt=0, le=1, description="share of missing pixels beyond which a frame is left")
+    max_missing_share: float = Field(
+        0.6, gt=0, le=1, description="share of missing pixels beyond which a frame is left"
+    )
     max_saturated_share: float = Field(0.5, gt=0, le=1, description="share of full pixels beyond which a frame is left")
     noisy_factor: float = Field(4.0, gt=1, description="noise over the expected noise that marks a frame as noisy")
-    gradient_sigma: float = Field(10.0, gt=0, description="range of the background over the noise that marks a gradient")
+    gradient_sigma: float = Field(
+        10.0, gt=0, description="range of the background over the noise that marks a gradient"
+    )
     default_psf_sigma_px: float = Field(0.8, gt=0.2, le=10, description="PSF core where neither camera nor label says")
     default_psf_misfit: float = Field(
         0.15, gt=0, le=1, description="share of a star's light off the Gaussian, where the camera does not say"
@@ -142,7 +147,7 @@ def _check_shape(pixels: Image, camera: CameraModel) -> None:
 def _saturation(detector: Detector, pixels: Image) -> float | None:
     """Declared saturation, else the end of an 8-bit range, where real images do saturate."""
     if detector.saturation_dn is None and pixels.dtype.kind == "u" and pixels.dtype.itemsize == 1:
-        return float(np.iinfo(pixels.dtype).max)
+        return float(_EIGHT_BIT_MAX)
     return detector.saturation_dn
 
 
@@ -232,7 +237,9 @@ def point_spread(state: State, options: FrameOptions) -> PointSpread:
     # A hundredth of the core's width cannot be told from none, and none is faster.
     if length < 0.1 * sigma:
         trail = np.zeros(2)
-    return PointSpread(sigma, (float(trail[0]), float(trail[1])), state.detector.psf_misfit or options.default_psf_misfit)
+    return PointSpread(
+        sigma, (float(trail[0]), float(trail[1])), state.detector.psf_misfit or options.default_psf_misfit
+    )
 
 
 def smear_trail(state: State) -> FloatArray:

@@ -180,9 +180,7 @@ _TELLING = (
 )
 
 
-def _conclude(
-    state: State, frame: Frame, estimate: _CombinedEstimate | None, outcomes: list[_Outcome]
-) -> Navigation:
+def _conclude(state: State, frame: Frame, estimate: _CombinedEstimate | None, outcomes: list[_Outcome]) -> Navigation:
     results = tuple(outcome for outcome in outcomes if isinstance(outcome, TechniqueResult))
     failures = tuple(outcome for outcome in outcomes if isinstance(outcome, TechniqueFailure))
     if estimate is not None:

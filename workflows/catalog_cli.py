@@ -24,7 +24,9 @@ def add(
     """Index a star table and give it a name."""
     label = name or table.stem
     if label in BUILT_IN_NAMES or not label.replace("-", "").replace("_", "").isalnum():
-        raise ConfigurationError(f"{label!r} cannot be a catalogue's name: letters, digits, - and _; not {', '.join(BUILT_IN_NAMES)}")
+        raise ConfigurationError(
+            f"{label!r} cannot be a catalogue's name: letters, digits, - and _; not {', '.join(BUILT_IN_NAMES)}"
+        )
     try:
         data = table.read_bytes()
         stars = read_table(data, table.name, apparent)

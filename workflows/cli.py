@@ -45,11 +45,16 @@ _LOG_EVERY_S = 5.0
 
 ArchiveArg = Annotated[str, typer.Argument(help="Folder or URL with an archive.yaml, or the path of one.")]
 RunArg = Annotated[Path, typer.Argument(help="Folder of a run.")]
-ConfigOption = Annotated[list[Path], typer.Option("--config", help="YAML file on top of the shipped ones (repeatable).")]
-SetOption = Annotated[
-    list[str], typer.Option("--set", help="One key, a.b=c; archive.KEY=VALUE replaces a key of archive.yaml (repeatable).")
+ConfigOption = Annotated[
+    list[Path], typer.Option("--config", help="YAML file on top of the shipped ones (repeatable).")
 ]
-OutputOption = Annotated[Path, typer.Option("--output", "-o", help="Folder of the run; an earlier run there is resumed.")]
+SetOption = Annotated[
+    list[str],
+    typer.Option("--set", help="One key, a.b=c; archive.KEY=VALUE replaces a key of archive.yaml (repeatable)."),
+]
+OutputOption = Annotated[
+    Path, typer.Option("--output", "-o", help="Folder of the run; an earlier run there is resumed.")
+]
 VerifyOption = Annotated[bool, typer.Option("--verify", help="Read inputs again instead of trusting size and time.")]
 
 
@@ -116,7 +121,9 @@ def run(
     with _follow(console, work) as listener:
         statuses = execute(work, options, listener)
     counts = ", ".join(f"{count} {status}" for status, count in sorted(statuses.items()))
-    console.print(f"{len(work.every)} images: {counts}. Tables and images/*.json in {output}", highlight=False, soft_wrap=True)
+    console.print(
+        f"{len(work.every)} images: {counts}. Tables and images/*.json in {output}", highlight=False, soft_wrap=True
+    )
     raise typer.Exit(exit_code(statuses))
 
 
@@ -135,7 +142,13 @@ def _follow(console: Console, work: Plan):  # type: ignore[no-untyped-def]
     answered = len(work.every) - total
     console.print(f"{len(work.every)} images, {answered} answered before, {total} to do", highlight=False)
     if console.is_terminal:
-        columns = (TextColumn("navigating"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), TextColumn("{task.description}"))
+        columns = (
+            TextColumn("navigating"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TimeRemainingColumn(),
+            TextColumn("{task.description}"),
+        )
         with Progress(*columns, console=console) as progress:
             task = progress.add_task("", total=total)
 

@@ -67,7 +67,7 @@ def offsets(folder: RunFolder) -> pd.DataFrame:
         raise ConfigurationError(f"{folder.root} holds no finished run: it has no table offsets")
     with duckdb.connect() as database:
         relation = database.read_parquet([str(path) for path in files], hive_partitioning=True)
-        return relation.order("image_id").df()
+        return pd.DataFrame(relation.order("image_id").df())
 
 
 def read_truth(path: Path) -> dict[str, dict[str, float]]:
@@ -110,7 +110,7 @@ def compare(table: pd.DataFrame, truth: Mapping[str, Mapping[str, float]]) -> tu
     tuple
         Joined table with errors and pulls; figures over all images that have truth.
     """
-    planted = pd.DataFrame.from_dict(truth, orient="index")[["offset_dv_px", "offset_du_px", "rotation_deg"]]
+    planted = pd.DataFrame.from_dict(dict(truth), orient="index")[["offset_dv_px", "offset_du_px", "rotation_deg"]]
     joined = table.merge(planted.add_prefix("planted_"), left_on="image_id", right_index=True, how="inner")
     for axis in ("dv", "du"):
         joined[f"error_{axis}_px"] = joined[f"offset_{axis}_px"] - joined[f"planted_offset_{axis}_px"]
@@ -129,6 +129,24 @@ def compare(table: pd.DataFrame, truth: Mapping[str, Mapping[str, float]]) -> tu
     return joined, agreement
 
 
+_COMPARISON = ("image", "outcome", "planted dv, du", "recovered dv, du", "error", "sigma", "rotation planted, found")
+
+
+def _comparison_row(row: Mapping[str, float | str]) -> list[str]:
+    """Cells of one image."""
+    number = {key: float(value) for key, value in row.items() if isinstance(value, int | float)}
+    answered = not math.isnan(number.get("offset_dv_px", math.nan))
+    turned = not math.isnan(number.get("rotation_deg", math.nan))
+    return [
+        str(row["image_id"]), str(row["status"] if row["status"] == "success" else row["status_reason"]),
+        f"{number['planted_offset_dv_px']:+.2f}, {number['planted_offset_du_px']:+.2f}",
+        f"{number['offset_dv_px']:+.3f}, {number['offset_du_px']:+.3f}" if answered else "",
+        f"{math.hypot(number['error_dv_px'], number['error_du_px']):.3f}" if answered else "",
+        f"{max(number['sigma_dv_px'], number['sigma_du_px']):.3f}" if answered else "",
+        f"{number['planted_rotation_deg']:+.3f}, {number['rotation_deg']:+.3f}" if turned else "",
+    ]  # fmt: skip
+
+
 def print_comparison(console: Console, joined: pd.DataFrame, agreement: Agreement, limit: int) -> None:
     """Table of recovered against planted, and the figures over all.
 
@@ -142,18 +160,10 @@ def print_comparison(console: Console, joined: pd.DataFrame, agreement: Agreemen
         Most rows shown.
     """
     table = Table(title="recovered against planted (pixels at the array centre)", title_justify="left")
-    for name in ("image", "outcome", "planted dv, du", "recovered dv, du", "error", "sigma", "rotation planted, found"):
-        table.add_column(name, justify="left" if name in ("image", "outcome") else "right", no_wrap=True)
-    for row in joined.head(limit).itertuples():
-        answered = not math.isnan(row.offset_dv_px)
-        rotation = f"{row.planted_rotation_deg:+.3f}, {row.rotation_deg:+.3f}" if not math.isnan(row.rotation_deg) else ""
-        table.add_row(
-            row.image_id, row.status if row.status == "success" else row.status_reason,
-            f"{row.planted_offset_dv_px:+.2f}, {row.planted_offset_du_px:+.2f}",
-            f"{row.offset_dv_px:+.3f}, {row.offset_du_px:+.3f}" if answered else "",
-            f"{math.hypot(row.error_dv_px, row.error_du_px):.3f}" if answered else "",
-            f"{max(row.sigma_dv_px, row.sigma_du_px):.3f}" if answered else "", rotation,
-        )  # fmt: skip
+    for name in _COMPARISON:
+        table.add_column(name, justify="left" if name in _COMPARISON[:2] else "right", no_wrap=True)
+    for row in joined.head(limit).to_dict("records"):
+        table.add_row(*_comparison_row({str(key): value for key, value in row.items()}))
     console.print(table)
     if len(joined) > limit:
         console.print(f"... and {len(joined) - limit} more")
@@ -178,8 +188,8 @@ def print_counts(console: Console, table: pd.DataFrame) -> None:
     grid = Table(box=None, pad_edge=False)
     for name in ("status", "reason", "images"):
         grid.add_column(name, justify="right" if name == "images" else "left")
-    for (status, reason), count in counts.items():
-        grid.add_row(status, reason, str(count))
+    for row in counts.reset_index(name="images").to_dict("records"):
+        grid.add_row(str(row["status"]), str(row["status_reason"]), str(row["images"]))
     console.print(grid)
 
 
@@ -193,12 +203,16 @@ def print_image(console: Console, document: Mapping[str, Json]) -> None:
     document
         The image's JSON document.
     """
-    console.print(f"[bold]{document['image_id']}[/bold]  {document['mission']} {document['camera']}  {document['time_utc']}")
+    console.print(
+        f"[bold]{document['image_id']}[/bold]  {document['mission']} {document['camera']}  {document['time_utc']}"
+    )
     console.print(f"{document['status']} ({document['status_reason']}), rank {document['rank']}: {document['detail']}")
     if isinstance(document["offset_px"], list):
         console.print(f"offset dv, du {_plain(document['offset_px'])} px, sigma {_plain(document['sigma_px'])} px")
     if document.get("rotation_deg") is not None:
-        console.print(f"rotation {_plain(document['rotation_deg'])} deg, sigma {_plain(document['sigma_rotation_deg'])} deg")
+        console.print(
+            f"rotation {_plain(document['rotation_deg'])} deg, sigma {_plain(document['sigma_rotation_deg'])} deg"
+        )
     table = Table(box=None, pad_edge=False)
     for name in ("technique", "outcome", "offset", "sigma", "rotation", "confidence", "used"):
         table.add_column(name)

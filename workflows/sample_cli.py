@@ -22,7 +22,9 @@ def stars(
     directory: Annotated[Path, typer.Argument(help="New or empty folder.")],
     frames: Annotated[int, typer.Option(min=1, help="Images to make.")] = 60,
     seed: Annotated[int, typer.Option(min=0, help="Same seed, same bytes.")] = 1,
-    false_fraction: Annotated[float, typer.Option(min=0.0, max=0.95, help="Share of detections that are no star.")] = 0.5,
+    false_fraction: Annotated[
+        float, typer.Option(min=0.0, max=0.95, help="Share of detections that are no star.")
+    ] = 0.5,
     processes: Annotated[int, typer.Option(min=1, help="Processes that draw.")] = 2,
 ) -> None:
     """Star fields of LORRI-, Cassini- and Voyager-like cameras with real catalogue stars."""

@@ -147,7 +147,9 @@ class ImageRunner:
         if description.geometry == "sidecar":
             raise GeometryError(StatusReason.GEOMETRY_MISSING, f"{path} is not there")
         if block is None:
-            raise GeometryError(StatusReason.CAMERA_UNKNOWN, "there is no sidecar, and no camera block claims the header")
+            raise GeometryError(
+                StatusReason.CAMERA_UNKNOWN, "there is no sidecar, and no camera block claims the header"
+            )
         return state_from_header(raw, ref.image_id, block, description.settings), block, "header"
 
     def _stars(self, ref: ImageRef, state: State, digests: dict[str, str | None]) -> StarTable:
@@ -169,8 +171,8 @@ class ImageRunner:
         catalogs = (*self._setup.star_digests, *((("per-image", table),) if table else ()))
         image = digests[ref.path]
         return Provenance(
-            self._setup.software, self._config_digest, ref.path, image, source, sidecar if source == "sidecar" else image,
-            catalogs,
+            self._setup.software, self._config_digest, ref.path, image, source,
+            sidecar if source == "sidecar" else image, catalogs,
         )  # fmt: skip
 
     def _error(
@@ -191,8 +193,8 @@ def _flags(raw: RawImage, block: InstrumentBlock | None) -> BoolArray | None:
     """Bad pixels by the product's own quality extension."""
     if block is None or block.quality_extension is None:
         return None
-    name = block.quality_extension.upper()
-    flags = next((image for key, image in raw.extensions.items() if key.upper() == name), None)
+    read = raw.extensions.get(block.quality_extension.upper())
+    flags = read() if read is not None else None
     return None if flags is None or flags.shape != raw.pixels.shape else np.asarray(flags != 0)
 
 

@@ -58,7 +58,7 @@ def quaternion_from_matrix(matrix: FloatArray) -> FloatArray:
     )
     quaternion = rows[int(np.argmax(squares))]
     quaternion = quaternion / np.linalg.norm(quaternion)
-    return -quaternion if quaternion[0] < 0 else quaternion
+    return np.asarray(-quaternion if quaternion[0] < 0 else quaternion)
 
 
 def rotation_about(axis: FloatArray, angle_rad: float) -> FloatArray:
@@ -78,7 +78,7 @@ def rotation_about(axis: FloatArray, angle_rad: float) -> FloatArray:
     """
     x, y, z = np.asarray(axis, dtype=float) / np.linalg.norm(axis)
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return np.eye(3) + np.sin(angle_rad) * cross + (1 - np.cos(angle_rad)) * (cross @ cross)
+    return np.asarray(np.eye(3) + np.sin(angle_rad) * cross + (1 - np.cos(angle_rad)) * (cross @ cross))
 
 
 def smallest_rotation(start: FloatArray, end: FloatArray) -> FloatArray:

@@ -75,8 +75,8 @@ def _fill_gaps(values: FloatArray) -> FloatArray:
 
 def _spread(values: FloatArray, shape_vu: tuple[int, int]) -> Image:
     """Tile values at every pixel, bilinear between tile centres."""
-    result: Image = cv2.resize(values.astype(np.float32), shape_vu[::-1], interpolation=cv2.INTER_LINEAR)
-    return result
+    spread = cv2.resize(values.astype(np.float32), shape_vu[::-1], interpolation=cv2.INTER_LINEAR)
+    return np.asarray(spread, np.float32)
 
 
 def estimate_background(

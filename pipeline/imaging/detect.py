@@ -42,7 +42,7 @@ def kernel_of(spread: PointSpread) -> FloatArray:
         along = (step + 0.5) / spread.substeps - 0.5
         dv, du = axis - along * spread.trail_vu[0], axis - along * spread.trail_vu[1]
         kernel += np.exp(-(dv[:, None] ** 2 + du[None, :] ** 2) / (2 * width))
-    return kernel / kernel.sum()
+    return np.asarray(kernel / kernel.sum())
 
 
 def matched_filter_snr(image: Image, bad: BoolArray, sigma: Image, spread: PointSpread) -> Image:
@@ -72,9 +72,7 @@ def matched_filter_snr(image: Image, bad: BoolArray, sigma: Image, spread: Point
         filtered = cv2.sepFilter2D(clean, cv2.CV_32F, line, line, borderType=cv2.BORDER_CONSTANT)
     else:
         filtered = cv2.filter2D(clean, cv2.CV_32F, kernel.astype(np.float32), borderType=cv2.BORDER_CONSTANT)
-    filtered /= np.float32(np.sqrt((kernel**2).sum()))
-    result: Image = filtered
-    return result
+    return np.asarray(filtered / np.float32(np.sqrt((kernel**2).sum())), np.float32)
 
 
 def local_maxima(snr: Image, threshold: float, radius_px: int, count: int) -> FloatArray:
@@ -195,6 +193,7 @@ def _without_repeats(fits: PointSources, spread: PointSpread) -> PointSources:
     fits = fits.take(order)
     if len(fits) < 2:
         return fits
-    gap = np.abs(fits.position_vu[:, None, :] - fits.position_vu[None, :, :]).max(axis=2)
-    repeats = np.tril(gap < spread.sigma_px, k=-1).any(axis=1)
+    v, u = fits.position_vu.T
+    close = (np.abs(v[:, None] - v) < spread.sigma_px) & (np.abs(u[:, None] - u) < spread.sigma_px)
+    repeats = np.tril(close, k=-1).any(axis=1)
     return fits.take(np.flatnonzero(~repeats))

@@ -34,7 +34,7 @@ def missing_pixels(image: Image, missing_value: float | None, level_dn: float, s
     """
     if missing_value is None or not np.isfinite(missing_value):
         return np.zeros(image.shape, bool)
-    equal = image == np.float32(missing_value)
+    equal: BoolArray = np.asarray(image == np.float32(missing_value))
     if not equal.any() or abs(level_dn - missing_value) > _CLEAR_OF_FILL_SIGMA * max(sigma_dn, 1e-6):
         return equal
     return _long_runs(equal, _run_length(equal))
@@ -51,7 +51,7 @@ def _long_runs(flags: BoolArray, length: int) -> BoolArray:
     if length > flags.shape[1]:
         return np.zeros_like(flags)
     bar = np.ones((1, length), np.uint8)
-    return cv2.morphologyEx(flags.astype(np.uint8), cv2.MORPH_OPEN, bar, borderValue=0).astype(bool)
+    return np.asarray(cv2.morphologyEx(flags.astype(np.uint8), cv2.MORPH_OPEN, bar, borderValue=0), bool)
 
 
 def saturated_pixels(image: Image, saturation_dn: float | None, read_noise_dn: float | None) -> BoolArray:

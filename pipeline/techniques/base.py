@@ -130,6 +130,8 @@ class TechniqueResult(Record):
         (2,) pixels.
     confidence
         Probability, in the technique's own model, that the answer is not a mistake.
+    measurements
+        Independent measurements in the fit (stars, vertices, pixels of a template).
     at_edge, at_edge_rotation
         The search ran into its bound: any of them, and the rotation's.
     spurious
@@ -148,6 +150,7 @@ class TechniqueResult(Record):
     information: FloatArray
     pivot_vu: FloatArray
     confidence: float
+    measurements: int = 1
     at_edge: bool = False
     at_edge_rotation: bool = False
     spurious: bool = False

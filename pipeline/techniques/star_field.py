@@ -12,6 +12,7 @@ from pipeline.techniques.star_fit import StarFit, StarFitOptions, fit_stars
 from pipeline.techniques.star_inventory import star_inventory
 from pipeline.techniques.star_match import (
     Hypothesis,
+    IntArray,
     MatchProblem,
     StarMatchOptions,
     chance_visible,
@@ -32,7 +33,9 @@ class StarFieldOptions(TechniqueOptions):
     match: StarMatchOptions = StarMatchOptions()
     fit: StarFitOptions = StarFitOptions()
     min_stars: int = Field(3, ge=2, le=50, description="fewest matched stars for an answer")
-    min_probability: float = Field(0.9999, gt=0.5, lt=1, description="posterior probability below which it is no answer")
+    min_probability: float = Field(
+        0.9999, gt=0.5, lt=1, description="posterior probability below which it is no answer"
+    )
 
 
 def star_field_nav(
@@ -82,7 +85,9 @@ def star_field_nav(
 def _hypotheses(problem: MatchProblem, options: StarFieldOptions) -> list[Hypothesis]:
     """Distinct assignments of enough stars, best first."""
     ratio = magnitude_log_ratio(problem, options.match)
-    refined = [refine(problem, ratio, offset, theta, options.match) for offset, theta in search(problem, ratio, options.match)]
+    refined = [
+        refine(problem, ratio, offset, theta, options.match) for offset, theta in search(problem, ratio, options.match)
+    ]
     found = [h for h in refined if h is not None and len(h.star) >= options.min_stars and np.isfinite(h.log_odds)]
     found.sort(key=lambda h: -h.log_odds)
     reach = float(np.hypot(*problem.shape_vu)) / 2
@@ -93,7 +98,7 @@ def _hypotheses(problem: MatchProblem, options: StarFieldOptions) -> list[Hypoth
     return distinct
 
 
-def pair_covariance(stars: PredictedStars, sources: PointSources, star: FloatArray, source: FloatArray) -> FloatArray:
+def pair_covariance(stars: PredictedStars, sources: PointSources, star: IntArray, source: IntArray) -> FloatArray:
     """Covariance of each matched pair: the centroid's and the catalogue place's.
 
     Parameters
@@ -131,7 +136,8 @@ def _result(
     searched = np.arange(len(stars)) < options.match.max_predicted
     return TechniqueResult(
         technique=NAME, offset_vu=fit.offset_vu, rotation_rad=fit.rotation_rad, information=fit.information,
-        pivot_vu=fit.pivot_vu, confidence=probability, at_edge=at_edge, at_edge_rotation=at_edge_rotation,
+        pivot_vu=fit.pivot_vu, confidence=probability, measurements=int(fit.inlier.sum()), at_edge=at_edge,
+        at_edge_rotation=at_edge_rotation,
         error_sources=("stars",),
         features=star_inventory(stars, sources, best.star, best.source, fit, context, searched),
         diagnostics={"stars_used": int(fit.inlier.sum()), "extra_sigma_px": fit.extra_sigma_px,

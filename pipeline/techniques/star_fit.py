@@ -27,7 +27,9 @@ _MIN_STARS_FOR_SCATTER = 6
 class StarFitOptions(Options):
     """Outliers and scatter."""
 
-    outlier_chance: float = Field(1e-3, gt=0, lt=0.5, description="chance by which a good star may look like an outlier")
+    outlier_chance: float = Field(
+        1e-3, gt=0, lt=0.5, description="chance by which a good star may look like an outlier"
+    )
     model_floor_px: float = Field(
         0.1, ge=0, le=5, description="per-axis camera-model error granted before a star counts as an outlier, pixels"
     )
@@ -151,7 +153,11 @@ class _Spread:
 
 
 def _reject(
-    context: NavContext, predicted_vu: FloatArray, measured_vu: FloatArray, covariance: FloatArray, options: StarFitOptions
+    context: NavContext,
+    predicted_vu: FloatArray,
+    measured_vu: FloatArray,
+    covariance: FloatArray,
+    options: StarFitOptions,
 ) -> BoolArray:
     """Drop the worst star, one at a time, until none is an outlier or too few would remain to tell.
 
@@ -218,7 +224,9 @@ def fit_stars(
         With one star, or without a rotation parameter, theta is zero; with one star its information is zero.
     """
     camera, prior = context.camera_model, context.camera_from_j2000
-    attitude = _solve(context, direction, measured_vu, _weights(covariance_vu + options.model_floor_px**2 * np.eye(2)), prior)
+    attitude = _solve(
+        context, direction, measured_vu, _weights(covariance_vu + options.model_floor_px**2 * np.eye(2)), prior
+    )
     near = project(camera, direction @ attitude.T)[0]
     inlier = _reject(context, near, measured_vu, covariance_vu, options)
     size = 3 if context.fit_camera_rotation else 2

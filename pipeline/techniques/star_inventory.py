@@ -1,6 +1,7 @@
 """Inventory of predicted stars after a technique has matched some of them."""
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.imaging.psf import PointSources
 from pipeline.predict.stars import PredictedStars
@@ -13,6 +14,12 @@ NOT_SEARCHED = "not_searched"
 OUTSIDE_FRAME = "outside_frame"
 NOT_DETECTED = "not_detected"
 PLACE_DISAGREES = "place_disagrees"
+
+# A star that was to be seen this clearly and is not there is looked for this far away, at up to a factor in flux.
+_CLEARLY_SEEN_SNR = 15.0
+_DISPLACED_PX = 30.0
+_FLUX_FACTOR = 3.0
+_CHANCE_NEIGHBOUR = 0.1
 
 
 def star_inventory(
@@ -61,6 +68,7 @@ def star_inventory(
     if searched is not None:
         reason[~searched] = NOT_SEARCHED
     reason[star] = np.where(fit.inlier, "", PLACE_DISAGREES)
+    _find_displaced(stars, sources, source, expected, measured, reason)
     return FeatureTable(
         name=stars.star_id, kind=np.full(n, "star"), predicted_vu=stars.position_vu, measured_vu=measured,
         residual_vu=measured - expected, sigma_px=sigma, mag=stars.mag, snr=stars.snr, used=used, reason=reason,
@@ -70,3 +78,29 @@ def star_inventory(
 def _on_array(position_vu: FloatArray, camera: CameraModel) -> BoolArray:
     with np.errstate(invalid="ignore"):
         return np.asarray(((position_vu > -0.5) & (position_vu < np.array(camera.shape_vu) - 0.5)).all(axis=1))
+
+
+def _find_displaced(
+    stars: PredictedStars,
+    sources: PointSources,
+    matched: IntArray,
+    expected_vu: FloatArray,
+    measured_vu: FloatArray,
+    reason: NDArray[np.str_],
+) -> None:
+    """Say where a missing star shines instead: the one unmatched source of its brightness near its place.
+
+    Only where chance would hardly put such a source there, by the density of unmatched sources at least as bright.
+    """
+    free = np.setdiff1d(np.arange(len(sources)), matched)
+    for k in np.flatnonzero((reason == NOT_DETECTED) & (stars.snr > _CLEARLY_SEEN_SNR)):
+        ratio = sources.flux_dn[free] / stars.flux_dn[k]
+        alike = free[(ratio > 1.0 / _FLUX_FACTOR) & (ratio < _FLUX_FACTOR)]
+        away = np.hypot(*(sources.position_vu[alike] - expected_vu[k]).T)
+        near = int(np.argmin(away)) if len(away) else -1
+        if near < 0 or away[near] > _DISPLACED_PX:
+            continue
+        span = np.ptp(sources.position_vu, axis=0)
+        if len(alike) * np.pi * away[near] ** 2 < _CHANCE_NEIGHBOUR * float(max(span.prod(), 1.0)):
+            reason[k] = PLACE_DISAGREES
+            measured_vu[k] = sources.position_vu[alike[near]]

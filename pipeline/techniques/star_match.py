@@ -33,7 +33,9 @@ class StarMatchOptions(Options):
 
     max_predicted: int = Field(60, ge=2, le=500, description="brightest predicted stars that take part in the search")
     completeness: float = Field(0.9, gt=0, lt=1, description="chance that a bright predicted star is in fact detected")
-    magnitude_sigma: float = Field(0.35, gt=0, le=3, description="1-sigma scatter of catalogue against measured magnitude")
+    magnitude_sigma: float = Field(
+        0.35, gt=0, le=3, description="1-sigma scatter of catalogue against measured magnitude"
+    )
     zero_point_sigma: float = Field(0.3, gt=0, le=3, description="1-sigma error of the camera's zero point, magnitudes")
     position_floor_px: float = Field(0.15, gt=0, le=3, description="per-axis error granted while matching, pixels")
     hypotheses: int = Field(8, ge=2, le=100, description="vote maxima that are refined")
@@ -312,7 +314,8 @@ def assign(
         (k,) star indices, (k,) source indices.
     """
     seen = transform(problem, offset_vu, rotation_rad)
-    distance2 = ((seen[:, None, :] - problem.measured_vu[None, :, :]) ** 2).sum(axis=2)
+    (seen_v, seen_u), (v, u) = seen.T, problem.measured_vu.T
+    distance2 = (seen_v[:, None] - v) ** 2 + (seen_u[:, None] - u) ** 2
     cost = distance2 / radius_px**2 - 0.2 * ratio
     cost = np.where((distance2 <= radius_px**2) & (ratio > -9.0), cost, np.inf)
     best_source, best_star = np.argmin(cost, axis=1), np.argmin(cost, axis=0)
@@ -400,9 +403,7 @@ def _outside(offset_vu: FloatArray, context: NavContext) -> bool:
     return bool((np.abs(offset_vu) > np.asarray(context.search_margin_vu) + _CELL_PX).any())
 
 
-def _log_posterior_share(
-    predicted_vu: FloatArray, weights: FloatArray, context: NavContext, turns: bool
-) -> float:
+def _log_posterior_share(predicted_vu: FloatArray, weights: FloatArray, context: NavContext, turns: bool) -> float:
     """Log of the share of the search volume that the posterior of offset (and rotation) fills."""
     total = float(weights.sum())
     margin_v, margin_u = context.search_margin_vu
@@ -429,9 +430,7 @@ def chance_visible(problem: MatchProblem) -> FloatArray:
         (n,) between 0 and 1.
     """
     low = np.maximum(problem.predicted_vu - problem.context.search_margin_vu, -0.5)
-    high = np.minimum(
-        problem.predicted_vu + problem.context.search_margin_vu, np.array(problem.shape_vu) - 0.5
-    )
+    high = np.minimum(problem.predicted_vu + problem.context.search_margin_vu, np.array(problem.shape_vu) - 0.5)
     inside = np.clip(high - low, 0, None) / (2 * np.asarray(problem.context.search_margin_vu))
     return np.asarray(inside.prod(axis=1) * problem.chance_detected)
 

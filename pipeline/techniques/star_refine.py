@@ -94,7 +94,8 @@ def _gate(
 
 def _apart(expected_vu: FloatArray, sigma_px: float) -> BoolArray:
     """False for a star that a brighter one (an earlier row) outshines: a fit there measures the brighter one."""
-    gap = np.linalg.norm(expected_vu[:, None, :] - expected_vu[None, :, :], axis=2)
+    v, u = expected_vu.T
+    gap = np.hypot(v[:, None] - v, u[:, None] - u)
     return np.asarray(~np.tril(gap < 2.0 * sigma_px, k=-1).any(axis=1))
 
 
@@ -114,7 +115,8 @@ def _result(
     at_edge, at_edge_rotation = edge_flags(fit.centre_offset_vu, fit.rotation_rad, context, options)
     return TechniqueResult(
         technique=NAME, offset_vu=fit.offset_vu, rotation_rad=fit.rotation_rad, information=fit.information,
-        pivot_vu=fit.pivot_vu, confidence=confidence, at_edge=at_edge, at_edge_rotation=at_edge_rotation,
+        pivot_vu=fit.pivot_vu, confidence=confidence, measurements=int(fit.inlier.sum()), at_edge=at_edge,
+        at_edge_rotation=at_edge_rotation,
         error_sources=("stars",), features=star_inventory(stars, fits, star, source, fit, context),
         diagnostics={"stars_used": int(fit.inlier.sum()), "extra_sigma_px": fit.extra_sigma_px},
     )  # fmt: skip

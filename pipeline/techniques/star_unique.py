@@ -1,5 +1,6 @@
 """StarUniqueMatchNav: one or two stars that nothing else in the frame can be taken for."""
 
+from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
@@ -31,6 +32,8 @@ from pipeline.techniques.star_match import (
 )
 
 NAME = "StarUniqueMatchNav"
+# Of the detection pairs with the right separation, those whose brightness fits best; the others cannot win.
+_MOST_PAIRS = 30
 
 
 class StarUniqueOptions(TechniqueOptions):
@@ -39,6 +42,7 @@ class StarUniqueOptions(TechniqueOptions):
     match: StarMatchOptions = StarMatchOptions()
     fit: StarFitOptions = StarFitOptions()
     brightest: int = Field(4, ge=1, le=20, description="brightest predicted stars tried")
+    min_visible: float = Field(0.15, ge=0, le=1, description="least chance that a star tried is in the frame")
     max_sources: int = Field(60, ge=1, le=500, description="brightest detections tried")
     separation_px: float = Field(1.0, gt=0, le=20, description="largest error of a pair's separation, pixels")
     min_probability_pair: float = Field(0.999, gt=0.5, lt=1, description="posterior probability asked of two stars")
@@ -76,9 +80,13 @@ def star_unique_nav(
         return TechniqueFailure(NAME, StatusReason.NO_FEATURES_PREDICTED, "no stars predicted")
     if not len(sources):
         return TechniqueFailure(NAME, StatusReason.NO_FEATURES_DETECTED, "no point sources detected")
-    bright = stars.take(np.arange(min(len(stars), options.brightest)))
     kept = sources.take(np.arange(min(len(sources), options.max_sources)))
-    problem = match_problem(bright, kept, detection_sigma, context, options.match)
+    everything = match_problem(stars, kept, detection_sigma, context, options.match)
+    # The brightest star does not help while it is off the array, wherever within the margin the camera points.
+    index = np.flatnonzero(chance_visible(everything) >= options.min_visible)[: options.brightest]
+    if not len(index):
+        return TechniqueFailure(NAME, StatusReason.NO_FEATURES_PREDICTED, "no star that is likely to be in the frame")
+    problem = match_problem(stars.take(index), kept, detection_sigma, context, options.match)
     ratio = magnitude_log_ratio(problem, options.match)
     visible = chance_visible(problem)
     best_chance = 0.0
@@ -89,8 +97,11 @@ def star_unique_nav(
         probability = posterior(np.array([h.log_odds for h in hypotheses]), visible[hypotheses[0].star])
         best_chance = max(best_chance, float(probability[0]))
         if probability[0] >= threshold:
-            return _result(stars, sources, hypotheses[0], float(probability[0]), context, options)
-    return TechniqueFailure(NAME, StatusReason.AMBIGUOUS_MATCH, f"no unmistakable star, best probability {best_chance:.4f}")
+            best = replace(hypotheses[0], star=index[hypotheses[0].star])
+            return _result(stars, sources, best, float(probability[0]), context, options)
+    return TechniqueFailure(
+        NAME, StatusReason.AMBIGUOUS_MATCH, f"no unmistakable star, best probability {best_chance:.4f}"
+    )
 
 
 def _pairs(problem: MatchProblem, ratio: np.ndarray, options: StarUniqueOptions) -> list[Hypothesis]:
@@ -104,7 +115,10 @@ def _pairs(problem: MatchProblem, ratio: np.ndarray, options: StarUniqueOptions)
         length = float(np.linalg.norm(problem.predicted_vu[a] - problem.predicted_vu[b]))
         fits = (first != second) & (np.abs(span - length) <= options.separation_px)
         fits &= (ratio[a, first] > -9) & (ratio[b, second] > -9)
-        for j, k in zip(first[fits], second[fits], strict=True):
+        candidates = np.flatnonzero(fits)
+        likely = ratio[a, first[candidates]] + ratio[b, second[candidates]]
+        candidates = candidates[np.argsort(-likely, kind="stable")[:_MOST_PAIRS]]
+        for j, k in zip(first[candidates], second[candidates], strict=True):
             hypothesis = _pair_hypothesis(problem, ratio, star, np.array([j, k]), options)
             if hypothesis is not None:
                 found.append(hypothesis)
@@ -177,7 +191,8 @@ def _result(
     at_edge, at_edge_rotation = edge_flags(fit.centre_offset_vu, fit.rotation_rad, context, options)
     return TechniqueResult(
         technique=NAME, offset_vu=fit.offset_vu, rotation_rad=fit.rotation_rad, information=fit.information,
-        pivot_vu=fit.pivot_vu, confidence=probability, at_edge=at_edge, at_edge_rotation=at_edge_rotation,
+        pivot_vu=fit.pivot_vu, confidence=probability, measurements=int(fit.inlier.sum()), at_edge=at_edge,
+        at_edge_rotation=at_edge_rotation,
         error_sources=("stars",),
         features=star_inventory(
             stars, sources, best.star, best.source, fit, context, mask_of(best.star, len(stars))
