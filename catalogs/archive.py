@@ -1,16 +1,19 @@
 """An archive: its description, and the list of its images."""
 
-import fnmatch
+import os
 import posixpath
 import re
+import zipfile
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 import fsspec
 import yaml
+from fsspec.implementations.local import LocalFileSystem
 from fsspec.spec import AbstractFileSystem
+from fsspec.utils import glob_translate
 from pydantic import Field, ValidationError
 
 from catalogs.geometry import first_problem, sidecar_image_id
@@ -21,6 +24,9 @@ from pipeline.options import Options
 DESCRIPTION = "archive.yaml"
 SIDECAR_SUFFIX = ".geometry.json"
 STARS_SUFFIX = ".stars.parquet"
+_OVERRIDE = "--set archive."
+# File names may have 255 bytes on every common file system; ending and temporary mark take 39 of them.
+_LONGEST_ID = 200
 
 
 class StarTableRef(Options):
@@ -91,6 +97,14 @@ def _filesystem(url: str) -> tuple[AbstractFileSystem, str]:
     return fs, root.rstrip("/")
 
 
+def _locate(url: str, path: str) -> tuple[AbstractFileSystem, str]:
+    """File system and full name of a file; joining URLs as text would break chained ones (``zip://::a.zip``)."""
+    if "://" in path:
+        return _filesystem(path)
+    fs, root = _filesystem(url)
+    return fs, f"{root}/{path}"
+
+
 def read_bytes(url: str, path: str) -> bytes:
     """Bytes of a file of an archive.
 
@@ -109,8 +123,8 @@ def read_bytes(url: str, path: str) -> bytes:
     if "://" not in url and "://" not in path:
         with open(posixpath.join(url, path), "rb") as file:
             return file.read()
-    fs, root = _filesystem(path if "://" in path else posixpath.join(url, path))
-    return bytes(fs.cat_file(root))
+    fs, full = _locate(url, path)
+    return bytes(fs.cat_file(full))
 
 
 def file_stamp(url: str, path: str) -> tuple[int, str] | None:
@@ -128,10 +142,14 @@ def file_stamp(url: str, path: str) -> tuple[int, str] | None:
     tuple or None
         Size in bytes; modification time or ETag as text. None where there is no such file.
     """
-    fs, full = _filesystem(posixpath.join(url, path))
+    fs, full = _locate(url, path)
     try:
+        if isinstance(fs, LocalFileSystem):
+            # fsspec tells a link's own time, not that of the file behind it.
+            status = os.stat(full)
+            return status.st_size, str(status.st_mtime_ns)
         info = fs.info(full)
-    except FileNotFoundError:
+    except (FileNotFoundError, NotADirectoryError):
         return None
     mark = next(
         (info[key] for key in ("ETag", "etag", "mtime", "last_modified", "LastModified", "created") if info.get(key)),
@@ -166,29 +184,37 @@ def open_archive(url: str, overrides: Mapping[str, object]) -> Archive:
     else:
         name = DESCRIPTION
     try:
-        fs, root = _filesystem(url)
-        content = yaml.safe_load(fs.cat_file(f"{root}/{name}")) if fs.exists(f"{root}/{name}") else None
-        is_folder = fs.isdir(root)
-    except (ValueError, ImportError) as error:
+        text = _description_text(url, name)
+    except (OSError, ValueError, ImportError, zipfile.BadZipFile) as error:
         raise ConfigurationError(f"archive {url}: {error}") from error
-    except yaml.YAMLError as error:
-        text = " ".join(str(error).split())
-        raise ConfigurationError(f"{url}/{name} is not YAML: {text}") from error
-    if content is None:
-        if not is_folder:
-            raise ConfigurationError(f"archive {url} is not a folder")
-        if "images" not in overrides:
-            raise ConfigurationError(f"{url} has no {name}; write one, or say --set archive.images='*.fits'")
-        content = {}
+    try:
+        content = None if text is None else yaml.safe_load(text)
+    except (yaml.YAMLError, RecursionError) as error:
+        raise ConfigurationError(f"{url}/{name} is not YAML: {error}") from error
+    if text is None and "images" not in overrides:
+        raise ConfigurationError(f"{url} has no {name}; write one, or say {_OVERRIDE}images='*.fits'")
+    content = {} if content is None else content
     if not isinstance(content, dict):
         raise ConfigurationError(f"{url}/{name} must hold keys and values, images: at least")
-    return Archive(url, _description({**content, **overrides}, f"{url}/{name}"))
+    return Archive(url, _description(content, overrides, f"{url}/{name}"))
 
 
-def _description(content: dict[str, object], source: str) -> ArchiveDescription:
+def _description_text(url: str, name: str) -> bytes | None:
+    """Bytes of the description, None where a folder has none."""
+    fs, full = _locate(url, name)
+    if fs.exists(full):
+        return bytes(fs.cat_file(full))
+    if not fs.isdir(posixpath.dirname(full)):
+        raise NotADirectoryError("there is no such folder")
+    return None
+
+
+def _description(content: dict[object, object], overrides: Mapping[str, object], source: str) -> ArchiveDescription:
     try:
-        return ArchiveDescription.model_validate(content)
+        return ArchiveDescription.model_validate({**{str(key): content[key] for key in content}, **overrides})
     except ValidationError as error:
+        key = str(error.errors(include_url=False)[0]["loc"][0])
+        source = f"{_OVERRIDE}{key}" if key in overrides else source
         allowed = ", ".join(ArchiveDescription.model_fields)
         raise ConfigurationError(f"{source}: {first_problem(error)} (keys: {allowed})") from error
 
@@ -211,33 +237,42 @@ def list_images(archive: Archive, blocks: Mapping[str, InstrumentBlock]) -> list
     Raises
     ------
     ConfigurationError
-        If nothing matches, or two images share an id.
+        If nothing matches, a name cannot be inside the archive, or two images share an id.
     """
     patterns = archive.description.images
-    patterns = [patterns] if isinstance(patterns, str) else patterns
+    patterns = [_inside(pattern) for pattern in ([patterns] if isinstance(patterns, str) else patterns)]
     fs, root = _filesystem(archive.url)
-    every = sorted(path[len(root) + 1 :] for path in fs.find(root))
+    # Some file systems list names with a leading slash below an empty root, some without.
+    every = sorted(path.removeprefix(root).lstrip("/") for path in fs.find(root))
     known = set(every)
     found: dict[str, bool] = {}
     for pattern in patterns:
-        if any(c in pattern for c in "*?["):
-            matched = [path for path in every if _matches(path, pattern)]
-            found.update(dict.fromkeys(matched, True))
+        if pattern in known or not any(c in pattern for c in "*?["):
+            found[pattern] = pattern in known
         else:
-            found[posixpath.normpath(pattern)] = posixpath.normpath(pattern) in known
+            matches = _matcher(pattern)
+            found.update({path: True for path in every if matches(path)})
     if not found:
         raise ConfigurationError(f"{archive.url}: no file matches images: {', '.join(patterns)}")
     refs = [ImageRef(_image_id(path, archive, known, blocks), path, exists) for path, exists in found.items()]
-    _refuse_collisions(refs)
+    _refuse_ids(refs)
     return sorted(refs, key=lambda ref: ref.image_id)
 
 
-def _matches(path: str, pattern: str) -> bool:
+def _inside(pattern: str) -> str:
+    """Pattern in its shortest form, refused where it cannot name files of the archive."""
+    short = posixpath.normpath(pattern)
+    if not pattern or "://" in pattern or short in (".", "..") or short.startswith(("/", "../")) or "\0" in pattern:
+        raise ConfigurationError(f"images: {pattern!r} is no path inside the archive")
+    return short
+
+
+def _matcher(pattern: str) -> Callable[[str], object]:
     """Shell pattern where ``*`` stays inside a folder and ``**`` does not."""
-    if "**" in pattern:
-        expression = re.escape(pattern).replace(r"\*\*/", "(?:.*/)?").replace(r"\*\*", ".*").replace(r"\*", "[^/]*")
-        return re.fullmatch(expression.replace(r"\?", "[^/]"), path) is not None
-    return path.count("/") == pattern.count("/") and fnmatch.fnmatchcase(path, pattern)
+    try:
+        return re.compile(glob_translate(pattern)).match
+    except (ValueError, re.error) as error:
+        raise ConfigurationError(f"images: {pattern!r} is no pattern: {error}") from error
 
 
 def stem(path: str) -> str:
@@ -260,13 +295,21 @@ def _image_id(path: str, archive: Archive, known: set[str], blocks: Mapping[str,
     """The sidecar's claim, else a product id that the file's name is, else the relative path."""
     sidecar = stem(path) + SIDECAR_SUFFIX
     if archive.description.geometry != "header" and sidecar in known:
-        claimed = sidecar_image_id(archive.read(sidecar))
+        claimed = _claimed_id(archive, sidecar)
         if claimed is not None:
             return _safe(claimed)
     name = posixpath.basename(stem(path))
     if any(b.product_id_pattern and re.fullmatch(b.product_id_pattern, name) for b in blocks.values()):
-        return name
+        return _safe(name)
     return _safe(stem(path))
+
+
+def _claimed_id(archive: Archive, sidecar: str) -> str | None:
+    try:
+        return sidecar_image_id(archive.read(sidecar))
+    except OSError:
+        # The image's own record will say that its sidecar cannot be read.
+        return None
 
 
 def _safe(text: str) -> str:
@@ -274,7 +317,11 @@ def _safe(text: str) -> str:
     return re.sub(r"[^\w.+=-]", "_", text.replace("/", "__"))
 
 
-def _refuse_collisions(refs: Sequence[ImageRef]) -> None:
+def _refuse_ids(refs: Sequence[ImageRef]) -> None:
+    """Ids name files: they must be short enough, and differ."""
+    long = next((ref for ref in refs if len(ref.image_id.encode()) > _LONGEST_ID), None)
+    if long is not None:
+        raise ConfigurationError(f"{long.path}: its image id is longer than {_LONGEST_ID} bytes: {long.image_id}")
     # Some file systems cannot tell ids apart that differ in case only.
     counts = Counter(ref.image_id.lower() for ref in refs)
     shared = [ref for ref in refs if counts[ref.image_id.lower()] > 1]

@@ -4,7 +4,7 @@ import json
 import warnings
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Annotated, Literal
+from typing import Literal
 
 import numpy as np
 from astropy.time import Time
@@ -14,7 +14,9 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from catalogs.images import CardValue, RawImage
 from catalogs.instruments import CameraMode, InstrumentBlock
+from pipeline.camera import unproject
 from pipeline.errors import ContractError, GeometryError
+from pipeline.geometry.astrometry import SPEED_OF_LIGHT_KM_S, julian_year
 from pipeline.geometry.rotations import matrix_from_quaternion
 from pipeline.options import InstrumentSettings
 from pipeline.records import Attitude, CameraModel, Detector, FloatArray, Spacecraft, State
@@ -24,35 +26,39 @@ from pipeline.status import StatusReason
 _CAMERA_FROM_LORRI = np.diag([1.0, -1.0, -1.0])
 # A header writes this where SPICE had nothing to say.
 _LORRI_UNKNOWN = -1.0e31
+# Beyond these no figure can be meant: camera in space, inside the heliosphere's surroundings, not tumbling.
+_YEARS = (1950.0, 2150.0)
+_FARTHEST_KM = 1e12
+_FASTEST_TURN_RAD_S = 10.0
 
-Number = Annotated[float, Field(allow_inf_nan=False)]
-Vector = tuple[Number, Number, Number]
+Vector = tuple[float, float, float]
 
 
 class _Block(BaseModel):
     """Part of a sidecar; keys that this version does not know are another tool's business."""
 
-    model_config = ConfigDict(frozen=True, extra="ignore")
+    model_config = ConfigDict(frozen=True, extra="ignore", allow_inf_nan=False)
 
 
 class _CameraBlock(_Block):
     shape_vu: tuple[int, int]
     focal_length_mm: float = Field(gt=0)
-    k_px_per_mm: tuple[tuple[Number, Number], tuple[Number, Number]]
-    principal_point_vu: tuple[Number, Number]
-    distortion_eps: tuple[Number, Number, Number, Number, Number, Number] = (0.0,) * 6
+    k_px_per_mm: tuple[tuple[float, float], tuple[float, float]]
+    principal_point_vu: tuple[float, float]
+    distortion_eps: tuple[float, float, float, float, float, float] = (0.0,) * 6
     psf_sigma_px: float | None = Field(None, gt=0.1, le=50)
     model_residual_px: float = Field(0.0, ge=0)
     read_noise_dn: float | None = Field(None, ge=0)
     gain_e_per_dn: float | None = Field(None, gt=0)
     bias_dn: float | None = None
     saturation_dn: float | None = None
-    missing_value: float | None = None
+    # Calibrated products mark what was never received by not-a-number, and say so.
+    missing_value: float | None = Field(None, allow_inf_nan=True)
     star_dn_per_s_mag0: float | None = Field(None, gt=0)
 
 
 class _AttitudeBlock(_Block):
-    camera_from_j2000_wxyz: tuple[Number, Number, Number, Number]
+    camera_from_j2000_wxyz: tuple[float, float, float, float]
     sigma_rad: Vector | None = None
     rate_rad_s: Vector | None = None
 
@@ -76,7 +82,7 @@ class Sidecar(_Block):
     bias_dn: float | None = None
     fit_camera_rotation: bool | None = None
     max_rotation_deg: float | None = Field(None, ge=0, le=45)
-    search_margin_vu: tuple[Number, Number] | None = None
+    search_margin_vu: tuple[float, float] | None = None
     attitude: _AttitudeBlock
     spacecraft: _SpacecraftBlock | None = None
 
@@ -96,14 +102,18 @@ def sidecar_image_id(data: bytes) -> str | None:
     """
     try:
         content = json.loads(data)
-    except ValueError:
+    except (ValueError, RecursionError):
         return None
     claimed = content.get("image_id") if isinstance(content, dict) else None
     return claimed if isinstance(claimed, str) and claimed else None
 
 
 def state_from_sidecar(
-    data: bytes, image_id: str, block: InstrumentBlock | None, overrides: Mapping[str, object]
+    data: bytes,
+    image_id: str,
+    block: InstrumentBlock | None,
+    overrides: Mapping[str, object],
+    shape_vu: tuple[int, ...] = (),
 ) -> State:
     """State of a ``geometry/1`` sidecar.
 
@@ -117,6 +127,8 @@ def state_from_sidecar(
         Camera to use where the sidecar brings none of its own.
     overrides
         The archive's settings, which win.
+    shape_vu
+        Of the image, which tells a block's modes apart.
 
     Returns
     -------
@@ -130,19 +142,42 @@ def state_from_sidecar(
     """
     try:
         sidecar = Sidecar.model_validate_json(data)
-        camera, detector = _sidecar_camera(sidecar, block)
+        camera, detector = _sidecar_camera(sidecar, block, shape_vu)
         spacecraft = sidecar.spacecraft or _SpacecraftBlock()
-        return State(
+        return _plausible(State(
             image_id=image_id, mission=sidecar.mission, camera=sidecar.camera, et=et_of_utc(sidecar.mid_time_utc),
             time_utc=sidecar.mid_time_utc, exposure_s=sidecar.exposure_s, camera_model=camera, detector=detector,
             attitude=_sidecar_attitude(sidecar.attitude),
             spacecraft=Spacecraft(_vector(spacecraft.position_km_ssb), _vector(spacecraft.velocity_kms_ssb)),
             settings=_settings(block, sidecar, overrides),
-        )  # fmt: skip
+        ))  # fmt: skip
     except ValidationError as error:
         raise GeometryError(StatusReason.GEOMETRY_INVALID, f"sidecar: {first_problem(error)}") from error
     except ContractError as error:
         raise GeometryError(StatusReason.GEOMETRY_INVALID, f"sidecar: {error}") from error
+
+
+def _plausible(state: State) -> State:
+    """The state, refused where a figure is out of this world and would only end in overflows."""
+    position, velocity, rate = state.spacecraft.position_km, state.spacecraft.velocity_km_s, state.attitude.rate_rad_s
+    year = julian_year(state.et)
+    rows, columns = state.camera_model.shape_vu
+    corners = np.array([[0.0, 0.0], [0.0, columns - 1.0], [rows - 1.0, 0.0], [rows - 1.0, columns - 1.0]])
+    with np.errstate(all="ignore"):
+        problem = next((text for text, wrong in (
+            (f"year {year:.6g} lies outside {_YEARS[0]:.0f} to {_YEARS[1]:.0f}", not _YEARS[0] < year < _YEARS[1]),
+            (f"spacecraft farther than {_FARTHEST_KM:g} km", _exceeds(position, _FARTHEST_KM)),
+            ("spacecraft as fast as light", _exceeds(velocity, 0.1 * SPEED_OF_LIGHT_KM_S)),
+            (f"camera turns faster than {_FASTEST_TURN_RAD_S:g} rad/s", _exceeds(rate, _FASTEST_TURN_RAD_S)),
+            ("camera model cannot be inverted over its array", not unproject(state.camera_model, corners)[1].all()),
+        ) if wrong), None)  # fmt: skip
+    if problem is not None:
+        raise ContractError(problem)
+    return state
+
+
+def _exceeds(vector: FloatArray | None, limit: float) -> bool:
+    return vector is not None and not bool(np.abs(vector).max() < limit)
 
 
 def first_problem(error: ValidationError) -> str:
@@ -163,12 +198,15 @@ def first_problem(error: ValidationError) -> str:
     return f"{where}: {problem['msg']}"
 
 
-def _sidecar_camera(sidecar: Sidecar, block: InstrumentBlock | None) -> tuple[CameraModel, Detector]:
+def _sidecar_camera(
+    sidecar: Sidecar, block: InstrumentBlock | None, shape_vu: tuple[int, ...]
+) -> tuple[CameraModel, Detector]:
     own = sidecar.camera_model
     if own is None:
         if block is None:
             raise GeometryError(StatusReason.CAMERA_UNKNOWN, "the sidecar brings no camera and the archive names none")
-        mode = next(iter(block.modes.values()))
+        modes = list(block.modes.values())
+        mode = next((mode for mode in modes if mode.shape_vu == shape_vu), modes[0])
         return mode.camera_model(), mode.detector()
     model = CameraModel(
         own.shape_vu, own.focal_length_mm, np.array(own.k_px_per_mm), np.array(own.principal_point_vu),
@@ -286,7 +324,9 @@ def state_from_header(raw: RawImage, image_id: str, block: InstrumentBlock, over
             StatusReason.GEOMETRY_MISSING, f"headers of {block.mission} {block.camera} carry no pointing"
         )
     try:
-        return _state_from_lorri(raw, image_id, block, overrides)
+        return _plausible(_state_from_lorri(raw, image_id, block, overrides))
+    except ValidationError as error:
+        raise GeometryError(StatusReason.GEOMETRY_INVALID, f"settings: {first_problem(error)}") from error
     except ContractError as error:
         raise GeometryError(StatusReason.GEOMETRY_INVALID, f"header: {error}") from error
 

@@ -1,7 +1,11 @@
 """Image files: bytes to pixels, header and the product's own bad-pixel flags."""
 
+import math
+import struct
 import warnings
-from collections.abc import Callable, Mapping
+import zlib
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from io import BytesIO
@@ -17,6 +21,36 @@ from pipeline.status import StatusReason
 
 CardValue = str | int | float | bool
 _BLOCK = 2880
+# What astropy lets through when a file is damaged.
+_DAMAGE = (
+    OSError, ValueError, TypeError, LookupError, AttributeError, ArithmeticError, VerifyError, MemoryError, EOFError,
+    struct.error, zlib.error,
+)  # fmt: skip
+
+
+class Cards(Mapping[str, CardValue]):
+    """Cards of a header; one that cannot be parsed, or has no value, counts as not there.
+
+    astropy parses a card when it is asked for, and it stays that way: a product has hundreds, a few are wanted.
+    """
+
+    def __init__(self, header: fits.Header) -> None:
+        self._header = header
+
+    def __getitem__(self, key: str) -> CardValue:
+        try:
+            value = self._header[key]
+        except VerifyError as error:
+            raise KeyError(key) from error
+        if not isinstance(value, str | int | float | bool):
+            raise KeyError(key)
+        return value
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._header)
+
+    def __len__(self) -> int:
+        return len(self._header)
 
 
 @dataclass(frozen=True)
@@ -30,7 +64,7 @@ class RawImage:
     header
         Cards of the image's header.
     extensions
-        Readers of the file's further two-dimensional images, by name in upper case.
+        Readers of the file's further two-dimensional images, by name in upper case; they raise ImageError.
     """
 
     pixels: Image
@@ -63,14 +97,21 @@ def read_image(data: bytes, name: str) -> RawImage:
     if not data.startswith(b"SIMPLE  ="):
         start = data[:8]
         raise ImageError(StatusReason.IMAGE_FORMAT_UNKNOWN, f"{name} is not a FITS file: it starts with {start!r}")
+    with _forgiving(name):
+        return _read_fits(data, name)
+
+
+@contextmanager
+def _forgiving(name: str) -> Iterator[None]:
+    """Silence for small breaches of the standard, an ImageError for damage."""
     with warnings.catch_warnings():
         # Old products break the standard in small ways (NEAR's cards do); what matters is checked below.
         warnings.simplefilter("ignore", VerifyWarning)
         warnings.simplefilter("ignore", AstropyUserWarning)
         try:
-            return _read_fits(data, name)
-        except (OSError, ValueError, TypeError, KeyError, IndexError, VerifyError, MemoryError) as error:
-            text = str(error).splitlines()[0] if str(error) else type(error).__name__
+            yield
+        except _DAMAGE as error:
+            text = " ".join(str(error).split()) or type(error).__name__
             raise ImageError(StatusReason.IMAGE_UNREADABLE, f"{name}: {text}") from error
 
 
@@ -84,20 +125,28 @@ def _read_fits(data: bytes, name: str) -> RawImage:
     for hdu in hdus:
         _check_length(hdu, len(data), name)
     extensions = {
-        hdu.name.upper(): partial(_pixels_of, hdu) for hdu in hdus if hdu is not first and hdu.is_image and hdu.name
+        hdu.name.upper(): partial(_pixels_of, hdu, name)
+        for hdu in hdus
+        if hdu is not first and hdu.is_image and hdu.name
     }
-    # astropy parses a card when it is asked for; a product's few hundred others stay text.
-    return RawImage(_pixels_of(first), first.header, extensions)
+    return RawImage(_pixels_of(first, name), Cards(first.header), extensions)
 
 
-def _pixels_of(hdu: fits.PrimaryHDU) -> Image:
-    return _native(np.squeeze(hdu.data))
+def _pixels_of(hdu: fits.PrimaryHDU, name: str) -> Image:
+    with _forgiving(name):
+        if hdu.data is None:
+            raise ImageError(StatusReason.IMAGE_UNREADABLE, f"{name}: {hdu.name} holds no pixels")
+        return _native(np.squeeze(hdu.data))
 
 
 def _check_length(hdu: fits.PrimaryHDU, length: int, name: str) -> None:
     """Data units must end before the file does; only the padding of the last block may be missing."""
     info = hdu.fileinfo()
-    end = info["datLoc"] + _data_bytes(hdu.header)
+    if isinstance(hdu, fits.CompImageHDU):
+        # Its header tells the size of the image, not of the table that holds it.
+        end = info["datLoc"] + info["datSpan"] - (_BLOCK - 1)
+    else:
+        end = info["datLoc"] + _data_bytes(hdu.header)
     if end > length:
         share = length / end
         raise ImageError(StatusReason.IMAGE_TRUNCATED, f"{name} has {length} bytes of {end} ({share:.0%})")
@@ -107,7 +156,7 @@ def _data_bytes(header: fits.Header) -> int:
     axes = [header[f"NAXIS{k + 1}"] for k in range(header.get("NAXIS", 0))]
     if not axes:
         return 0
-    elements = int(np.prod(axes, dtype=np.int64))
+    elements = math.prod(axes)
     return int(abs(header["BITPIX"]) // 8 * header.get("GCOUNT", 1) * (header.get("PCOUNT", 0) + elements))
 
 

@@ -1,9 +1,10 @@
 """Schema of the camera blocks in ``catalogs/config/config_4N0_inst_*.yaml``."""
 
+import re
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
 from pipeline.options import InstrumentSettings, Options
 from pipeline.records import CameraModel, Detector
@@ -12,12 +13,29 @@ Pair = tuple[float, float]
 Triple = tuple[float, float, float]
 
 
+def _invertible(matrix: tuple[Pair, Pair]) -> tuple[Pair, Pair]:
+    (a, b), (c, d) = matrix
+    if a * d == b * c:
+        raise ValueError("the matrix must have an inverse")
+    return matrix
+
+
+def _regular_expression(text: str) -> str:
+    try:
+        re.compile(text)
+    except re.error as error:
+        raise ValueError(f"no regular expression: {error}") from error
+    return text
+
+
 class CameraMode(Options):
     """One read-out mode of a camera: array, optics and detector."""
 
     shape_vu: tuple[Annotated[int, Field(ge=16, le=16384)], Annotated[int, Field(ge=16, le=16384)]]
     focal_length_mm: float = Field(gt=0)
-    k_px_per_mm: tuple[Pair, Pair] = Field(description="[[Kx, Kxy], [Kyx, Ky]], photo-plane mm to (u, v) pixels")
+    k_px_per_mm: Annotated[tuple[Pair, Pair], AfterValidator(_invertible)] = Field(
+        description="[[Kx, Kxy], [Kyx, Ky]], photo-plane mm to (u, v) pixels"
+    )
     principal_point_vu: Pair
     distortion_eps: tuple[float, float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     search_margin_vu: Pair | None = Field(None, description="replaces the block's margin in this mode, pixels")
@@ -53,6 +71,8 @@ class InstrumentBlock(InstrumentSettings):
     camera: str
     header: Literal["lorri"] | None = Field(None, description="reader of pointing cards in the product's own label")
     identify: dict[str, str] = Field(default_factory=dict, description="header cards that mark this camera's products")
-    product_id_pattern: str | None = Field(None, description="regular expression of a file stem that is a product id")
+    product_id_pattern: Annotated[str, AfterValidator(_regular_expression)] | None = Field(
+        None, description="regular expression of a file stem that is a product id"
+    )
     quality_extension: str | None = Field(None, description="name of the extension whose non-zero pixels are bad")
-    modes: dict[str, CameraMode]
+    modes: dict[str, CameraMode] = Field(min_length=1, description="read-out modes by name")

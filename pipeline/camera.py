@@ -12,6 +12,8 @@ UNPROJECT_TOLERANCE_PX = 1e-8
 _MAX_NEWTON_STEPS = 30
 # A step that would leave this multiple of the array's own extent means that the model folds over there.
 _MAX_PHOTO_RADIUS_FACTOR = 4.0
+# Points between the optical axis and a solution at which the model must not be turned inside out.
+_FOLD_SAMPLES = 32
 
 
 def distort(camera: CameraModel, photo_mm: FloatArray) -> FloatArray:
@@ -163,8 +165,8 @@ def unproject(camera: CameraModel, pixels_vu: FloatArray) -> tuple[FloatArray, B
 def _newton(camera: CameraModel, pixels_vu: FloatArray, start_mm: FloatArray) -> tuple[FloatArray, BoolArray]:
     """Photo-plane points that project to ``pixels_vu``; flags where the residual is within tolerance."""
     scale = np.abs(np.linalg.inv(camera.k_px_per_mm)).max()
-    limit = _MAX_PHOTO_RADIUS_FACTOR * scale * max(camera.shape_vu) + np.abs(start_mm).max(initial=0.0)
     photo = np.where(np.isfinite(start_mm), start_mm, 0.0)
+    limit = _MAX_PHOTO_RADIUS_FACTOR * scale * max(camera.shape_vu) + np.abs(photo).max(initial=0.0)
     residual = np.full_like(photo, np.inf)
     for _ in range(_MAX_NEWTON_STEPS):
         distorted = distort(camera, photo)
@@ -174,11 +176,22 @@ def _newton(camera: CameraModel, pixels_vu: FloatArray, start_mm: FloatArray) ->
             break
         step = _solve_2x2(_pixel_jacobian(camera, distorted) @ distort_jacobian(camera, photo), residual, scale)
         photo = np.clip(photo + step, -limit, limit)
-    # Beyond a fold of the distortion the residual can vanish at a wrong root, where the model is turned inside out.
-    turned = distort_jacobian(camera, photo)
-    upright = turned[:, 0, 0] * turned[:, 1, 1] - turned[:, 0, 1] * turned[:, 1, 0] > 0
-    converged = (np.abs(residual) <= UNPROJECT_TOLERANCE_PX).all(axis=1) & upright
-    return photo, np.asarray(converged)
+    converged = (np.abs(residual) <= UNPROJECT_TOLERANCE_PX).all(axis=1)
+    return photo, np.asarray(converged & _before_fold(camera, photo))
+
+
+def _before_fold(camera: CameraModel, photo_mm: FloatArray) -> BoolArray:
+    """True where the model is nowhere turned inside out between the optical axis and a point.
+
+    Beyond a fold the residual can vanish at a wrong root, also on a branch that a second fold has turned upright again.
+    """
+    share = np.linspace(1.0 / _FOLD_SAMPLES, 1.0, _FOLD_SAMPLES)
+    on_the_way = (share[:, None, None] * photo_mm).reshape(-1, 2)
+    jacobian = _pixel_jacobian(camera, distort(camera, on_the_way)) @ distort_jacobian(camera, on_the_way)
+    (a, b), (c, d) = np.moveaxis(jacobian, 0, 2)
+    # Rows are (v, u), columns (x, y): the order alone turns the sign.
+    upright = camera.handedness * (b * c - a * d) > 0
+    return np.asarray(upright.reshape(_FOLD_SAMPLES, -1).all(axis=0))
 
 
 def _solve_2x2(matrix: FloatArray, right: FloatArray, scale: float) -> FloatArray:
@@ -257,7 +270,9 @@ def field_of_view(camera: CameraModel, margin_vu: tuple[float, float] = (0.0, 0.
     outline = [(v, u) for v in (low_v, middle_v, high_v) for u in (low_u, middle_u, high_u)]
     rays, ok = unproject(camera, np.array(outline))
     axis = unproject(camera, camera.centre_vu[None])[0][0]
-    if not ok.any() or not np.isfinite(axis).all():
+    if not np.isfinite(axis).all():
         return np.array([0.0, 0.0, 1.0]), float(np.pi)
+    if ok.sum() <= 1:  # The middle alone is no cone.
+        return axis, float(np.pi)
     half = float(np.arccos(np.clip(rays[ok] @ axis, -1, 1)).max())
     return axis, half if ok.all() else min(2.0 * half, float(np.pi))

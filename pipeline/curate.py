@@ -23,6 +23,8 @@ Row = dict[str, Json]
 SCHEMA = "pilotage/1"
 # Digits kept of feature positions, in decimals of a pixel; a hundredth of the best centroid's sigma.
 _PIXEL_DIGITS = 5
+# No measured offset is known only to a thousand pixels: beyond that a variance is a share of the sentinel, a null.
+_UNKNOWN_VARIANCE = 1.0e6
 
 
 class RankTier(Options):
@@ -128,7 +130,7 @@ def error_document(image_id: str, reason: StatusReason, detail: str, provenance:
 
 
 def rank_of(navigation: Navigation, options: RankOptions) -> Rank:
-    """Tier of an answer, from its confidence and the translation's sigma alone.
+    """Tier of an answer, from its confidence and the translation's sigma alone; low at the edge of the search.
 
     Parameters
     ----------
@@ -147,6 +149,8 @@ def rank_of(navigation: Navigation, options: RankOptions) -> Rank:
         return Rank.CONFLICTED
     if status is not Status.SUCCESS or estimate is None:
         return Rank.FAILED
+    if navigation.reason is StatusReason.NAVIGATED_AT_EDGE:
+        return Rank.LOW
     worst = float(np.max(corrected_sigma_px(estimate)))
     for rank, tier in ((Rank.HIGH, options.high), (Rank.MEDIUM, options.medium)):
         if estimate.confidence >= tier.min_confidence and worst <= tier.max_sigma_px:
@@ -209,7 +213,9 @@ def _frame_figures(frame: Frame) -> dict[str, Json]:
 
 def _technique(result: TechniqueResult, estimate: _CombinedEstimate | None) -> dict[str, Json]:
     covariance = covariance_of(result.information)
-    turns = result.degrees_of_freedom == 3 and result.information[2, 2] > 0
+    unknown = np.diag(covariance) > _UNKNOWN_VARIANCE
+    covariance[unknown, :] = covariance[:, unknown] = np.nan
+    turns = result.degrees_of_freedom == 3 and not unknown[2]
     excluded = dict(estimate.excluded) if estimate is not None else {}
     document: dict[str, Json] = {
         "technique": result.technique, "status_reason": StatusReason.NAVIGATED.value, "detail": "",

@@ -126,7 +126,8 @@ def ensemble(
     if not usable:
         return None
     arm = float(np.hypot(*context.camera_model.shape_vu)) / 2
-    placed = [_place(result, context, arm) for result in usable]
+    turned_rad = _turned(usable)
+    placed = [_place(result, context, arm, turned_rad) for result in usable]
     clusters = _clusters(placed, options)
     clusters.sort(key=_strength, reverse=True)
     best = clusters[0]
@@ -139,24 +140,36 @@ def ensemble(
 
 
 def _usable(results: Sequence[TechniqueResult]) -> tuple[list[TechniqueResult], list[tuple[str, str]]]:
-    sound = [r for r in results if not r.spurious]
     excluded = [(r.technique, "spurious") for r in results if r.spurious]
+    excluded += [(r.technique, "uninformative") for r in results if not r.spurious and not r.information.any()]
+    sound = [r for r in results if not r.spurious and r.information.any()]
     inside = [r for r in sound if not r.at_edge]
     if inside:
         excluded += [(r.technique, "at_edge") for r in sound if r.at_edge]
     return inside or sound, excluded
 
 
-def _place(result: TechniqueResult, context: NavContext, arm: float) -> _Placed:
-    """Move to the array centre, exactly, and measure theta in pixels at ``arm``."""
+def _turned(results: Sequence[TechniqueResult]) -> float:
+    """Rotation of the answer that knows it best, zero where none does."""
+    seen = [r for r in results if r.degrees_of_freedom == 3 and r.information[2, 2] > 0]
+    return max(seen, key=lambda r: float(r.information[2, 2])).rotation_rad if seen else 0.0
+
+
+def _place(result: TechniqueResult, context: NavContext, arm: float, turned_rad: float) -> _Placed:
+    """Move to the array centre, exactly, and measure theta in pixels at ``arm``.
+
+    An answer without a rotation of its own holds at any: it is moved under ``turned_rad``, since over degrees the
+    curvature of the arc that the move is linear in comes to pixels.
+    """
     centre = context.camera_model.centre_vu
     size = result.degrees_of_freedom
-    offset, inverse = move_pivot(result.offset_vu, result.rotation_rad, result.pivot_vu, centre)
+    theta = result.rotation_rad if size == 2 or result.information[2, 2] > 0 else turned_rad
+    offset, inverse = move_pivot(result.offset_vu, theta, result.pivot_vu, centre)
     if size == 2:
         return _Placed(result, offset, result.information)
     scale = np.diag([1.0, 1.0, 1.0 / arm])
     back = inverse @ scale
-    state = np.append(offset, result.rotation_rad * arm)
+    state = np.append(offset, theta * arm)
     return _Placed(result, state, back.T @ result.information @ back)
 
 
@@ -213,13 +226,12 @@ def _strength(cluster: list[_Placed]) -> tuple[float, int, float]:
 
 
 def _reason(best: list[_Placed], clusters: list[list[_Placed]], options: EnsembleOptions) -> StatusReason:
-    if all(p.result.at_edge for p in best):
-        return StatusReason.AT_SEARCH_EDGE
     if max(p.result.confidence for p in best) < options.min_confidence:
         return StatusReason.LOW_CONFIDENCE
     if any(_strength(other)[0] >= options.rival_share * _strength(best)[0] for other in clusters if other is not best):
         return StatusReason.TECHNIQUES_DISAGREE
-    return StatusReason.NAVIGATED
+    # Only where nothing else is left do such answers come this far; the rank says what to think of them.
+    return StatusReason.NAVIGATED_AT_EDGE if all(p.result.at_edge for p in best) else StatusReason.NAVIGATED
 
 
 def _combine(

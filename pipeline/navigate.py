@@ -109,7 +109,7 @@ def navigate(
     on_stage("predict")
     outcomes = _first_pass(predicted, frame, context, options, on_stage)
     first = _fuse(outcomes, context, state, options)
-    if first is not None and first.reason is StatusReason.NAVIGATED:
+    if first is not None and first.reason in (StatusReason.NAVIGATED, StatusReason.NAVIGATED_AT_EDGE):
         outcomes += _second_pass(predicted, frame, first, context, options)
         on_stage("refine")
     estimate = _fuse(outcomes, context, state, options)

@@ -170,6 +170,8 @@ class Attitude(Record):
         self._freeze(camera_from_j2000=(3, 3), sigma_rad=(3,), rate_rad_s=(3,))
         if not np.allclose(self.camera_from_j2000 @ self.camera_from_j2000.T, np.eye(3), atol=1e-9):
             raise ContractError("camera_from_j2000 is not a rotation")
+        if np.linalg.det(self.camera_from_j2000) < 0:
+            raise ContractError("camera_from_j2000 is a reflection")
 
 
 @dataclass(frozen=True, eq=False)

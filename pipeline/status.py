@@ -28,6 +28,7 @@ class StatusReason(StrEnum):
     # success
     NAVIGATED = "navigated"
     NAVIGATED_ONE_DIRECTION = "navigated_one_direction"
+    NAVIGATED_AT_EDGE = "navigated_at_edge"
     # failed: the image was read, no answer can be vouched for
     IMAGE_BLANK = "image_blank"
     IMAGE_OVEREXPOSED = "image_overexposed"
@@ -37,7 +38,6 @@ class StatusReason(StrEnum):
     NO_FEATURES_DETECTED = "no_features_detected"
     NO_MATCH = "no_match"
     AMBIGUOUS_MATCH = "ambiguous_match"
-    AT_SEARCH_EDGE = "at_search_edge"
     LOW_CONFIDENCE = "low_confidence"
     # conflicted
     TECHNIQUES_DISAGREE = "techniques_disagree"
@@ -58,10 +58,10 @@ class StatusReason(StrEnum):
 
 
 _STATUS_OF_REASON = {
-    Status.SUCCESS: ("navigated", "navigated_one_direction"),
+    Status.SUCCESS: ("navigated", "navigated_one_direction", "navigated_at_edge"),
     Status.FAILED: (
         "image_blank", "image_overexposed", "image_mostly_missing", "image_not_finite", "no_features_predicted",
-        "no_features_detected", "no_match", "ambiguous_match", "at_search_edge", "low_confidence",
+        "no_features_detected", "no_match", "ambiguous_match", "low_confidence",
     ),
     Status.CONFLICTED: ("techniques_disagree",),
 }  # fmt: skip

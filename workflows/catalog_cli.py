@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from catalogs.star_sources import TableProblem, read_table
-from catalogs.stars import BUILT_IN_NAMES, build_index, cache_folder, open_index
+from catalogs.stars import BUILT_IN_NAMES, added_index, build_index, cache_folder, is_catalog_name, open_index
 from pipeline.errors import ConfigurationError
 from workflows.store import write_atomically
 
@@ -23,7 +23,7 @@ def add(
 ) -> None:
     """Index a star table and give it a name."""
     label = name or table.stem
-    if label in BUILT_IN_NAMES or not label.replace("-", "").replace("_", "").isalnum():
+    if not is_catalog_name(label):
         raise ConfigurationError(
             f"{label!r} cannot be a catalogue's name: letters, digits, - and _; not {', '.join(BUILT_IN_NAMES)}"
         )
@@ -36,9 +36,12 @@ def add(
         raise ConfigurationError(str(error)) from error
     folder = cache_folder()
     digest = hashlib.sha256(data + (b"apparent" if apparent else b"mean")).hexdigest()
-    index = build_index(stars, label, digest, folder)
-    (folder / "added").mkdir(parents=True, exist_ok=True)
-    write_atomically(folder / "added" / f"{label}.json", json.dumps({"file": index.path.name}).encode())
+    try:
+        index = build_index(stars, label, digest, folder)
+        (folder / "added").mkdir(parents=True, exist_ok=True)
+        write_atomically(folder / "added" / f"{label}.json", json.dumps({"file": index.path.name}).encode())
+    except OSError as error:
+        raise ConfigurationError(f"cannot write the cache {folder}: {error.strerror}") from error
     typer.echo(f"{label}: {len(stars)} stars")
 
 
@@ -48,5 +51,9 @@ def list_catalogs() -> None:
     for name in BUILT_IN_NAMES:
         typer.echo(f"{name}: built in")
     for link in sorted((cache_folder() / "added").glob("*.json")):
-        index = open_index(cache_folder() / json.loads(link.read_text())["file"])
+        path = added_index(link.stem, cache_folder())
+        if path is None or not path.exists():
+            typer.echo(f"{link.stem}: its index is gone; add it again")
+            continue
+        index = open_index(path)
         typer.echo(f"{link.stem}: {len(index.rows)} stars, sha256 {index.sha256[:16]}")

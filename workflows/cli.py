@@ -15,6 +15,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from catalogs.archive import Archive, open_archive
+from catalogs.images import read_image
 from pipeline.errors import ConfigurationError, PilotageError
 from workflows import catalog_cli, sample_cli
 from workflows.config import Configuration, load_configuration, parse_setting
@@ -29,8 +30,8 @@ from workflows.report import (
     progress_of,
     read_truth,
 )
-from workflows.run import EXIT_INTERRUPTED, EXIT_NOT_STARTED, RunListener, execute, exit_code, prepare_folder
-from workflows.store import RunFolder, read_json
+from workflows.run import EXIT_INTERRUPTED, EXIT_NOT_STARTED, RunListener, execute, exit_code
+from workflows.store import RunFolder, read_json, refuse_foreign, write_atomically
 from workflows.task import Outcome
 
 app = typer.Typer(
@@ -42,6 +43,7 @@ app.add_typer(catalog_cli.app, name="catalog")
 
 _ARCHIVE_KEY = "archive."
 _LOG_EVERY_S = 5.0
+_PIPE_WIDTH = 400
 
 ArchiveArg = Annotated[str, typer.Argument(help="Folder or URL with an archive.yaml, or the path of one.")]
 RunArg = Annotated[Path, typer.Argument(help="Folder of a run.")]
@@ -86,6 +88,7 @@ def plan(
     verify: VerifyOption = False,
 ) -> None:
     """Say what `run` would do, and do nothing."""
+    refuse_foreign(RunFolder(output))
     work = make_plan(*_open(archive, config, settings), RunFolder(output), verify)
     typer.echo(f"{len(work.every)} images, {len(work.every) - len(work.todo)} answered, {len(work.todo)} to do")
     for ref in work.todo[:20]:
@@ -113,17 +116,19 @@ def run(
     if serial and scheduler:
         raise ConfigurationError("--serial and --scheduler exclude each other")
     folder = RunFolder(output)
-    opened, configuration = _open(archive, config, settings)
-    prepare_folder(folder)
-    work = make_plan(opened, configuration, folder, verify)
+    # The death of a worker closes a socket under our hands, which is no reason to end.
+    signal.signal(signal.SIGPIPE, signal.SIG_IGN)
+    refuse_foreign(folder)
+    work = make_plan(*_open(archive, config, settings), folder, verify)
     options = ClusterOptions(0 if serial else workers, scheduler, memory_limit)
     console = Console(stderr=True)
     with _follow(console, work) as listener:
         statuses = execute(work, options, listener)
     counts = ", ".join(f"{count} {status}" for status, count in sorted(statuses.items()))
     console.print(
-        f"{len(work.every)} images: {counts}. Tables and images/*.json in {output}", highlight=False, soft_wrap=True
-    )
+        f"{len(work.every)} images: {counts}. Tables and images/*.json in {output}",
+        highlight=False, soft_wrap=True, markup=False,
+    )  # fmt: skip
     raise typer.Exit(exit_code(statuses))
 
 
@@ -190,6 +195,9 @@ def show(
 ) -> None:
     """Show outcome counts, one image, or a run against planted truth."""
     folder, console = RunFolder(run_folder), Console()
+    if not console.is_terminal:
+        # A pipe has no width; what reads it should get whole rows.
+        console.width = _PIPE_WIDTH
     if image is not None:
         document = read_json(folder.document(image))
         if document is None:
@@ -200,6 +208,26 @@ def show(
     print_counts(console, table)
     if truth is not None:
         print_comparison(console, *compare(table, read_truth(truth)), limit)
+
+
+@app.command()
+def picture(
+    run_folder: RunArg,
+    archive: ArchiveArg,
+    image: Annotated[str, typer.Argument(help="Image id.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="PNG to write.")],
+) -> None:
+    """Draw one image with what was predicted, used and refused."""
+    # Drawing libraries take half a second to load, which no other command should pay.
+    from workflows.picture import draw_image
+
+    document = read_json(RunFolder(run_folder).document(image))
+    if document is None or not isinstance(document["provenance"], dict):
+        raise ConfigurationError(f"{run_folder} has no image {image}")
+    path = str(document["provenance"]["image_path"])
+    raw = read_image(open_archive(archive, {}).read(path), path)
+    write_atomically(output, draw_image(raw.pixels, document))
+    typer.echo(f"{output}")
 
 
 @app.command("config")
@@ -214,16 +242,25 @@ def main() -> None:
     signal.signal(signal.SIGPIPE, signal.SIG_DFL)
     try:
         code = app(standalone_mode=False)
-    except PilotageError as error:
-        typer.echo(f"pilotage: {error}", err=True)
-        code = EXIT_NOT_STARTED
-    except click.ClickException as error:
+    except click.exceptions.NoArgsIsHelpError as error:
         error.show()
         code = EXIT_NOT_STARTED
+    except click.ClickException as error:
+        code = _complain(error.format_message())
+    except OSError as error:
+        # Full disks and lost mounts: no fault of any one image, so the run has stopped.
+        code = _complain(f"{error.filename or 'input or output'}: {error.strerror or error}")
+    except PilotageError as error:
+        code = _complain(str(error))
     except (KeyboardInterrupt, click.Abort):
         typer.echo("pilotage: interrupted; run the same command again to go on", err=True)
         code = EXIT_INTERRUPTED
     sys.exit(code if isinstance(code, int) else 0)
+
+
+def _complain(text: str) -> int:
+    typer.echo(f"pilotage: {' '.join(text.split())}", err=True)
+    return EXIT_NOT_STARTED
 
 
 if __name__ == "__main__":

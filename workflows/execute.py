@@ -4,8 +4,11 @@ import logging
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
+from uuid import uuid4
 
 import dask
+from dask.utils import format_bytes, parse_bytes
 from distributed import Client, Future, KilledWorker, LocalCluster, Worker, WorkerPlugin, as_completed, get_worker
 
 from catalogs.archive import ImageRef
@@ -16,10 +19,11 @@ from workflows.store import to_json, write_atomically
 from workflows.task import ImageRunner, Outcome, lost_document
 
 Listener = Callable[[Outcome], None]
-_PLUGIN = "pilotage-image-runner"
 # Tasks waiting per worker: enough that none ever idles, few enough that a killed run wastes nothing.
 _IN_FLIGHT_PER_WORKER = 6
-_CONNECT_TIMEOUT_S = 20
+_CONNECT_TIMEOUT_S = 10
+# An idle worker with catalogues and compiled kernels takes a third of this.
+_LEAST_MEMORY = 2**29
 
 
 @dataclass(frozen=True)
@@ -44,9 +48,9 @@ class ClusterOptions:
 class RunnerPlugin(WorkerPlugin):  # type: ignore[misc]
     """Opens catalogues and options once per worker, also on workers that start later."""
 
-    name = _PLUGIN
-
     def __init__(self, setup: Setup) -> None:
+        # One name per run: two runs may share a scheduler.
+        self.name = f"pilotage-{uuid4().hex}"
         self._setup = setup
         self.runner: ImageRunner | None = None
 
@@ -55,14 +59,15 @@ class RunnerPlugin(WorkerPlugin):  # type: ignore[misc]
         self.runner = ImageRunner(self._setup)
 
 
-def _on_worker(ref: ImageRef) -> Outcome:
-    plugin = get_worker().plugins[_PLUGIN]
+def _on_worker(ref: ImageRef, plugin_name: str) -> Outcome:
+    plugin = get_worker().plugins[plugin_name]
     outcome: Outcome = plugin.runner.run(ref)
     return outcome
 
 
-def run_plan(plan: Plan, options: ClusterOptions, on_done: Listener, on_ready: Callable[[str], None]) -> None:
-    """Do all that is still to be done.
+@contextmanager
+def open_workers(plan: Plan, options: ClusterOptions) -> Iterator[Callable[[Listener, Callable[[str], None]], None]]:
+    """Have workers ready for all that is still to be done; nothing is written before the result is called.
 
     Parameters
     ----------
@@ -70,29 +75,46 @@ def run_plan(plan: Plan, options: ClusterOptions, on_done: Listener, on_ready: C
         The work.
     options
         Where.
-    on_done
-        Called in this process with every finished image.
-    on_ready
-        Called once with a description of the workers when they are up.
+
+    Yields
+    ------
+    callable
+        Takes a function called in this process with every finished image, and one called once with a description of
+        the workers; returns when all images are done.
+
+    Raises
+    ------
+    ConfigurationError
+        If there is no such scheduler, it has no workers, or the memory limit is no size or too small.
     """
     if not plan.todo:
-        return
-    if options.workers == 0 and options.scheduler is None:
-        on_ready("this process")
-        runner = ImageRunner(plan.setup)
-        for ref in plan.todo:
-            on_done(runner.run(ref))
-        return
-    with _client(options) as client:
-        _await_workers(client)
-        client.register_plugin(RunnerPlugin(plan.setup), name=_PLUGIN)
-        count = len(client.scheduler_info(n_workers=-1)["workers"])
-        on_ready(f"{count} worker{'s' if count != 1 else ''}, dashboard {client.dashboard_link}")
-        lost = _drain(client, plan.todo, max(count, 1) * _IN_FLIGHT_PER_WORKER, on_done)
-        # An image may have died with its neighbour's worker. Alone, only its own death is counted.
-        for ref in lost:
-            for again in _drain(client, [ref], 1, on_done):
-                on_done(_record_loss(plan.setup, again))
+        yield lambda on_done, on_ready: None
+    elif options.workers == 0 and options.scheduler is None:
+        yield partial(_run_here, plan)
+    else:
+        with _client(options) as client:
+            _await_workers(client)
+            yield partial(_run_on, client, plan)
+
+
+def _run_here(plan: Plan, on_done: Listener, on_ready: Callable[[str], None]) -> None:
+    on_ready("this process")
+    runner = ImageRunner(plan.setup)
+    for ref in plan.todo:
+        on_done(runner.run(ref))
+
+
+def _run_on(client: Client, plan: Plan, on_done: Listener, on_ready: Callable[[str], None]) -> None:
+    plugin = RunnerPlugin(plan.setup)
+    client.register_plugin(plugin, name=plugin.name)
+    count = len(client.scheduler_info(n_workers=-1)["workers"])
+    on_ready(f"{count} worker{'s' if count != 1 else ''}, dashboard {client.dashboard_link}")
+    lost = _drain(client, plugin.name, plan.todo, max(count, 1) * _IN_FLIGHT_PER_WORKER, on_done)
+    # An image may have died with its neighbour's worker. Alone, only its own death is counted.
+    for ref in lost:
+        for again in _drain(client, plugin.name, [ref], 1, on_done):
+            on_done(_record_loss(plan.setup, again))
+    client.unregister_worker_plugin(plugin.name)
 
 
 def _await_workers(client: Client) -> None:
@@ -104,13 +126,18 @@ def _await_workers(client: Client) -> None:
 
 @contextmanager
 def _client(options: ClusterOptions) -> Iterator[Client]:
-    logging.getLogger("distributed").setLevel(logging.ERROR)
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)
+    memory = _memory(options.memory_limit)
     with dask.config.set(
         {
             "distributed.scheduler.allowed-failures": 1,
             # A small queue on each worker hides the scheduler's latency; nothing is lost by it, tasks are short.
             "distributed.scheduler.worker-saturation": 2.0,
             "distributed.comm.timeouts.connect": _CONNECT_TIMEOUT_S,
+            # A worker that waits for memory which only it holds would wait for ever: it is ended instead.
+            "distributed.worker.memory.target": False,
+            "distributed.worker.memory.spill": False,
+            "distributed.worker.memory.pause": False,
         }
     ):
         if options.scheduler is not None:
@@ -123,7 +150,7 @@ def _client(options: ClusterOptions) -> Iterator[Client]:
             return
         with (
             LocalCluster(
-                n_workers=options.workers, threads_per_worker=1, processes=True, memory_limit=options.memory_limit,
+                n_workers=options.workers, threads_per_worker=1, processes=True, memory_limit=memory,
                 dashboard_address="localhost:0", silence_logs=logging.CRITICAL,
             ) as cluster,
             Client(cluster) as client,
@@ -131,7 +158,19 @@ def _client(options: ClusterOptions) -> Iterator[Client]:
             yield client
 
 
-def _drain(client: Client, refs: Sequence[ImageRef], in_flight: int, on_done: Listener) -> list[ImageRef]:
+def _memory(text: str) -> int:
+    try:
+        size = int(parse_bytes(text))
+    except ValueError as error:
+        raise ConfigurationError(f"--memory-limit {text}: say a size such as 4GiB") from error
+    if size < _LEAST_MEMORY:
+        raise ConfigurationError(f"--memory-limit {text}: a worker needs {format_bytes(_LEAST_MEMORY)} at least")
+    return size
+
+
+def _drain(
+    client: Client, plugin_name: str, refs: Sequence[ImageRef], in_flight: int, on_done: Listener
+) -> list[ImageRef]:
     """Run images with a bounded number in flight; returns those whose worker died."""
     waiting = iter(refs)
     ref_of: dict[str, ImageRef] = {}
@@ -140,7 +179,7 @@ def _drain(client: Client, refs: Sequence[ImageRef], in_flight: int, on_done: Li
         ref = next(waiting, None)
         if ref is None:
             return None
-        future = client.submit(_on_worker, ref, pure=False)
+        future = client.submit(_on_worker, ref, plugin_name, pure=False)
         ref_of[future.key] = ref
         return future
 

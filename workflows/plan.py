@@ -127,7 +127,8 @@ def make_plan(archive: Archive, configuration: Configuration, run_folder: RunFol
     """
     name = archive.description.instrument
     if name is not None and name not in configuration.instruments:
-        raise ConfigurationError(f"instrument {name} is not configured; known: {', '.join(configuration.instruments)}")
+        known = ", ".join(configuration.instruments)
+        raise ConfigurationError(f"{archive.url}: instrument: {name} is not configured; known: {known}")
     _check_settings(archive)
     indexes, per_image = open_star_tables(archive)
     setup = Setup(
@@ -180,24 +181,28 @@ def _star_index(archive: Archive, entry: str | StarTableRef) -> StarIndex:
             added = added_index(entry, folder)
             if added is None:
                 known = ", ".join((*BUILT_IN_NAMES, PER_IMAGE))
-                raise ConfigurationError(f"stars: {entry} is neither {known} nor added by `pilotage catalog add`")
+                raise ConfigurationError(
+                    f"{archive.url}: stars: {entry} is neither {known} nor added by `pilotage catalog add`"
+                )
             return open_index(added)
         data = archive.read(entry.path)
         apparent = entry.place == "apparent"
         digest = hashlib.sha256(data + entry.place.encode()).hexdigest()
         return build_index(read_table(data, entry.path, apparent), entry.path, digest, folder)
     except FileNotFoundError as error:
-        raise ConfigurationError(f"stars: {error.filename or entry} is not there") from error
+        name = entry if isinstance(entry, str) else entry.path
+        raise ConfigurationError(f"{archive.url}: stars: {name} is not there") from error
     except TableProblem as error:
-        raise ConfigurationError(f"stars: {error}") from error
+        raise ConfigurationError(f"{archive.url}: stars: {error}") from error
     except OSError as error:
-        raise ConfigurationError(f"star index in {folder}: {error}") from error
+        raise ConfigurationError(f"{archive.url}: stars: {error}") from error
 
 
 def _is_done(ref: ImageRef, setup: Setup, verify: bool) -> bool:
     """Whether the run folder holds this image's answer to these very inputs."""
     mark = read_json(setup.run_folder.mark(ref.image_id))
-    if mark is None or not setup.run_folder.document(ref.image_id).exists():
+    # The mark of one answer must not vouch for another: that of a run killed in between, or a damaged one.
+    if mark is None or mark.get("document_sha256") != _digest_of_document(setup.run_folder, ref.image_id):
         return False
     recorded = mark.get("inputs")
     if not isinstance(recorded, dict) or set(recorded) != set(setup.inputs_of(ref)):
@@ -211,20 +216,32 @@ def _is_done(ref: ImageRef, setup: Setup, verify: bool) -> bool:
     return mark.get("task_id") == setup.task_id(ref.image_id, digests)
 
 
+def _digest_of_document(folder: RunFolder, image_id: str) -> str | None:
+    try:
+        return hashlib.sha256(folder.document(image_id).read_bytes()).hexdigest()
+    except (FileNotFoundError, IsADirectoryError):
+        return ""
+
+
 _CHANGED = "changed"
 
 
 def _known_digest(archive: Archive, path: str, entry: Json, verify: bool) -> str | None:
-    """Digest of an input: recorded if the file looks unchanged, read if asked for; None where there is no file."""
-    stamp = file_stamp(archive.url, path)
+    """Digest of an input: recorded if the file looks unchanged, else read; None where there is no file."""
     recorded = entry if isinstance(entry, dict) else {}
-    if stamp is None:
-        return None if recorded.get("sha256") is None else _CHANGED
-    if verify:
-        return hashlib.sha256(archive.read(path)).hexdigest()
     sha256 = recorded.get("sha256")
-    same = [recorded.get("size"), recorded.get("mark")] == list(stamp)
-    return sha256 if same and isinstance(sha256, str) else _CHANGED
+    try:
+        stamp = file_stamp(archive.url, path)
+        if stamp is None:
+            return None
+        if recorded.get("size") != stamp[0]:
+            return _CHANGED
+        if verify or not isinstance(sha256, str) or recorded.get("mark") != stamp[1]:
+            return hashlib.sha256(archive.read(path)).hexdigest()
+    except OSError:
+        # Whoever works on the image will say in its record what is wrong with the file.
+        return _CHANGED
+    return sha256
 
 
 @lru_cache(maxsize=1)
@@ -243,28 +260,6 @@ def software_id() -> str:
             digest.update(path.relative_to(root).as_posix().encode())
             digest.update(path.read_bytes())
     return f"pilotage {version('pilotage')} ({digest.hexdigest()[:12]})"
-
-
-def input_marks(archive: Archive, digests: Mapping[str, str | None]) -> dict[str, Json]:
-    """Record of inputs for an image's mark: digest, size and modification time of each.
-
-    Parameters
-    ----------
-    archive
-        The archive.
-    digests
-        sha256 by path, None for files that are not there.
-
-    Returns
-    -------
-    dict
-        JSON values.
-    """
-    marks: dict[str, Json] = {}
-    for path, sha256 in digests.items():
-        stamp = file_stamp(archive.url, path) if sha256 is not None else None
-        marks[path] = {"sha256": sha256, "size": stamp[0] if stamp else None, "mark": stamp[1] if stamp else None}
-    return marks
 
 
 def ids_of(refs: Sequence[ImageRef]) -> list[str]:

@@ -11,11 +11,15 @@ import duckdb
 import numpy as np
 import pandas as pd
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
+from rich.text import Text
 
 from pipeline.curate import Json
 from pipeline.errors import ConfigurationError
 from workflows.store import RunFolder, read_json
+
+_PLANTED = ["offset_dv_px", "offset_du_px", "rotation_deg"]
 
 
 @dataclass(frozen=True)
@@ -90,7 +94,9 @@ def read_truth(path: Path) -> dict[str, dict[str, float]]:
     """
     try:
         frames = json.loads(path.read_text())["frames"]
-        return {key.removesuffix(".fits"): dict(value) for key, value in frames.items()}
+        return {
+            key.removesuffix(".fits"): {name: float(value[name]) for name in _PLANTED} for key, value in frames.items()
+        }
     except (OSError, ValueError, KeyError, AttributeError, TypeError) as error:
         raise ConfigurationError(f"{path} is no truth.json: {type(error).__name__}: {error}") from error
 
@@ -110,7 +116,7 @@ def compare(table: pd.DataFrame, truth: Mapping[str, Mapping[str, float]]) -> tu
     tuple
         Joined table with errors and pulls; figures over all images that have truth.
     """
-    planted = pd.DataFrame.from_dict(dict(truth), orient="index")[["offset_dv_px", "offset_du_px", "rotation_deg"]]
+    planted = pd.DataFrame.from_dict(dict(truth), orient="index", columns=_PLANTED)
     joined = table.merge(planted.add_prefix("planted_"), left_on="image_id", right_index=True, how="inner")
     for axis in ("dv", "du"):
         joined[f"error_{axis}_px"] = joined[f"offset_{axis}_px"] - joined[f"planted_offset_{axis}_px"]
@@ -203,10 +209,11 @@ def print_image(console: Console, document: Mapping[str, Json]) -> None:
     document
         The image's JSON document.
     """
-    console.print(
-        f"[bold]{document['image_id']}[/bold]  {document['mission']} {document['camera']}  {document['time_utc']}"
-    )
-    console.print(f"{document['status']} ({document['status_reason']}), rank {document['rank']}: {document['detail']}")
+    # Texts from files may hold brackets, which rich would take for its markup.
+    console.print(Text(f"{document['image_id']}", style="bold"), end="")
+    console.print(Text(f"  {document['mission']} {document['camera']}  {document['time_utc']}"))
+    outcome = f"{document['status']} ({document['status_reason']}), rank {document['rank']}: {document['detail']}"
+    console.print(outcome, markup=False)
     if isinstance(document["offset_px"], list):
         console.print(f"offset dv, du {_plain(document['offset_px'])} px, sigma {_plain(document['sigma_px'])} px")
     if document.get("rotation_deg") is not None:
@@ -220,7 +227,7 @@ def print_image(console: Console, document: Mapping[str, Json]) -> None:
         features = technique.get("features")
         used = sum(map(bool, features["used"])) if isinstance(features, dict) else ""  # type: ignore[arg-type]
         table.add_row(
-            str(technique["technique"]), str(technique["detail"] or technique["status_reason"]),
+            str(technique["technique"]), escape(str(technique["detail"] or technique["status_reason"])),
             *(_plain(technique.get(key)) for key in ("offset_px", "sigma_px", "rotation_deg", "confidence")), str(used),
         )  # fmt: skip
     console.print(table)

@@ -11,9 +11,9 @@ from importlib.metadata import version
 
 from pipeline.curate import Json
 from pipeline.status import Status
-from workflows.execute import ClusterOptions, run_plan
+from workflows.execute import ClusterOptions, open_workers
 from workflows.plan import Plan, ids_of
-from workflows.store import RunFolder, exclusive, prepare, read_json, to_json, write_atomically, write_tables
+from workflows.store import RunFolder, exclusive, read_json, sweep, to_json, write_atomically, write_tables
 from workflows.task import Outcome
 
 EXIT_ALL_NAVIGATED = 0
@@ -53,11 +53,13 @@ def execute(plan: Plan, options: ClusterOptions, listener: RunListener) -> Count
     folder = plan.setup.run_folder
     started = datetime.now(UTC)
     ids = ids_of(plan.every)
-    with exclusive(folder):
+    with open_workers(plan, options) as run_images, exclusive(folder):
         digest = hashlib.sha256(json.dumps(ids).encode() + plan.setup.configuration.digest().encode()).hexdigest()
         (folder.root / "run.json").unlink(missing_ok=True)
         write_atomically(folder.plan, to_json({"images": list(ids), "digest": digest}))
-        run_plan(plan, options, listener.on_done, listener.on_ready)
+        run_images(listener.on_done, listener.on_ready)
+        # A worker may die while it writes.
+        sweep(folder)
         write_tables(folder, ids)
         statuses = _statuses(folder, ids)
         write_atomically(folder.root / "run.json", to_json(_summary(plan, started, statuses, digest)))
@@ -101,21 +103,3 @@ def exit_code(statuses: Counter[str]) -> int:
     if statuses[Status.FAILED.value] or statuses[Status.CONFLICTED.value]:
         return EXIT_SOME_FAILED
     return EXIT_ALL_NAVIGATED
-
-
-def prepare_folder(folder: RunFolder) -> None:
-    """Make a run's folder ready to be planned into.
-
-    Parameters
-    ----------
-    folder
-        The run.
-
-    Raises
-    ------
-    ConfigurationError
-        If it cannot be written, holds something else, or another run is at work in it.
-    """
-    folder.root.mkdir(parents=True, exist_ok=True) if not folder.root.exists() else None
-    with exclusive(folder):
-        prepare(folder)

@@ -19,6 +19,7 @@ from pipeline.errors import ConfigurationError
 
 # Images whose rows are written together: bounds memory and fixes the row groups whatever the worker count.
 _IMAGES_PER_GROUP = 2000
+_LOCK = ".lock"
 _TEMPORARY = re.compile(r"^\.[^/]+\.[0-9a-f]{32}$")
 
 
@@ -52,6 +53,34 @@ class RunFolder:
         return self.state / f"{image_id}.json"
 
 
+def refuse_foreign(folder: RunFolder) -> None:
+    """Make sure that a place is free or holds a run.
+
+    Parameters
+    ----------
+    folder
+        The run, not necessarily existing; nothing is written.
+
+    Raises
+    ------
+    ConfigurationError
+        If something else is there.
+    """
+    try:
+        present = {entry.name for entry in folder.root.iterdir()}
+    except FileNotFoundError:
+        return
+    except OSError as error:
+        raise ConfigurationError(f"cannot use {folder.root} for a run: {error.strerror}") from error
+    if folder.plan.name in present:
+        return
+    # A run that was killed before its plan was written has its lock, and maybe what the lock was taken for.
+    ours = {_LOCK, folder.images.name, folder.state.name} if _LOCK in present else set()
+    strangers = sorted(name for name in present - ours if not _TEMPORARY.match(name))
+    if strangers:
+        raise ConfigurationError(f"{folder.root} is not empty and holds no run: {strangers[0]}")
+
+
 def prepare(folder: RunFolder) -> None:
     """Make the folders and sweep temporary files that a killed run has left.
 
@@ -65,40 +94,56 @@ def prepare(folder: RunFolder) -> None:
     ConfigurationError
         If the place cannot be written, or holds something that is no run.
     """
+    refuse_foreign(folder)
     try:
-        if folder.root.is_dir() and not folder.plan.exists() and any(folder.root.iterdir()):
-            strangers = [p.name for p in folder.root.iterdir() if p.name not in (".lock", "images", "state")]
-            if strangers:
-                raise ConfigurationError(f"{folder.root} is not empty and holds no run: {sorted(strangers)[0]}")
         for path in (folder.images, folder.state):
             path.mkdir(parents=True, exist_ok=True)
-            for entry in path.iterdir():
-                if _TEMPORARY.match(entry.name):
-                    entry.unlink(missing_ok=True)
+        sweep(folder)
     except OSError as error:
         raise ConfigurationError(f"cannot write {folder.root}: {error.strerror}") from error
 
 
 @contextmanager
 def exclusive(folder: RunFolder) -> Iterator[None]:
-    """Hold the run's lock; the system lets go of it when the process dies.
+    """Hold a run's lock, with its folders made; the system lets go of it when the process dies.
 
     Parameters
     ----------
     folder
-        The run, prepared.
+        The run.
 
     Raises
     ------
     ConfigurationError
-        If another process is at work in it.
+        If the place cannot be written, holds something else, or another process is at work in it.
     """
-    with (folder.root / ".lock").open("w") as lock:
+    refuse_foreign(folder)
+    try:
+        folder.root.mkdir(parents=True, exist_ok=True)
+        lock = (folder.root / _LOCK).open("w")
+    except OSError as error:
+        raise ConfigurationError(f"cannot write {folder.root}: {error.strerror}") from error
+    with lock:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
             raise ConfigurationError(f"another run is at work in {folder.root}") from error
+        prepare(folder)
         yield
+
+
+def sweep(folder: RunFolder) -> None:
+    """Remove temporary files that a killed process has left.
+
+    Parameters
+    ----------
+    folder
+        The run, locked.
+    """
+    for path in (folder.root, folder.images, folder.state):
+        for entry in os.scandir(path):
+            if _TEMPORARY.match(entry.name):
+                (path / entry.name).unlink(missing_ok=True)
 
 
 def write_atomically(path: Path, data: bytes) -> None:
@@ -148,7 +193,7 @@ def read_json(path: Path) -> dict[str, Json] | None:
     """
     try:
         content = json.loads(path.read_bytes())
-    except (FileNotFoundError, ValueError):
+    except (FileNotFoundError, NotADirectoryError, IsADirectoryError, ValueError, RecursionError):
         return None
     return content if isinstance(content, dict) else None
 

@@ -3,14 +3,13 @@
 import hashlib
 import time
 import traceback
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
 
-from catalogs.archive import SIDECAR_SUFFIX, STARS_SUFFIX, ImageRef, stem
+from catalogs.archive import SIDECAR_SUFFIX, STARS_SUFFIX, Archive, ImageRef, file_stamp, stem
 from catalogs.geometry import identify, state_from_header, state_from_sidecar
 from catalogs.images import RawImage, read_image
 from catalogs.instruments import InstrumentBlock
@@ -23,7 +22,7 @@ from pipeline.navigate import Navigation, navigate
 from pipeline.predict.stars import reach_px
 from pipeline.records import BoolArray, StarTable, State
 from pipeline.status import StatusReason
-from workflows.plan import Setup, input_marks
+from workflows.plan import Setup
 from workflows.store import to_json, write_atomically
 
 # What a bug in the science can raise. Trouble with the output (OSError) is not among them: a full disk stops the run.
@@ -62,6 +61,43 @@ class Stopwatch:
         return time.perf_counter() - self._start
 
 
+class Inputs:
+    """Files that decide one image's answer, as they were when they were read.
+
+    Parameters
+    ----------
+    archive
+        Where they lie.
+    """
+
+    def __init__(self, archive: Archive) -> None:
+        self._archive = archive
+        self._stamps: dict[str, tuple[int, str] | None] = {}
+        self.data: dict[str, bytes | None] = {}
+        self.digests: dict[str, str | None] = {}
+
+    def read(self, path: str) -> None:
+        """Read a file, or note that it is not there.
+
+        The stamp comes before the bytes: a file that is changed meanwhile is then read again by the next run.
+        """
+        self._stamps[path] = file_stamp(self._archive.url, path)
+        try:
+            data = self._archive.read(path)
+        except (FileNotFoundError, NotADirectoryError):
+            self.data[path] = self.digests[path] = None
+            return
+        self.data[path], self.digests[path] = data, hashlib.sha256(data).hexdigest()
+
+    def marks(self) -> dict[str, Json]:
+        """Digest, size and modification mark of each, as JSON values."""
+        marks: dict[str, Json] = {}
+        for path, sha256 in self.digests.items():
+            stamp = self._stamps[path] if sha256 is not None else None
+            marks[path] = {"sha256": sha256, "size": stamp[0] if stamp else None, "mark": stamp[1] if stamp else None}
+        return marks
+
+
 class ImageRunner:
     """Everything a process needs to work on images, opened once.
 
@@ -93,57 +129,58 @@ class ImageRunner:
             Whatever happened.
         """
         watch = Stopwatch()
-        digests: dict[str, str | None] = dict.fromkeys(self._setup.inputs_of(ref))
+        inputs = Inputs(self._setup.archive)
+        document, data, lasting = self._answer(ref, inputs, watch)
+        watch.lap("curate")
+        write_atomically(self._setup.run_folder.document(ref.image_id), data)
+        watch.lap("write")
+        if lasting:
+            self._mark(ref, inputs, hashlib.sha256(data).hexdigest(), watch)
+        return Outcome(ref.image_id, str(document["status"]), str(document["status_reason"]), watch.total())
+
+    def _answer(self, ref: ImageRef, inputs: Inputs, watch: Stopwatch) -> tuple[dict[str, Json], bytes, bool]:
+        """Document of an image whatever happens, its bytes, and whether the same inputs would give it again."""
         lasting = True
         try:
-            document = self._document(ref, digests, watch)
+            # All of them, also where the first one fails: the mark is to know what was there.
+            for path in self._setup.inputs_of(ref):
+                inputs.read(path)
+            document = self._document(ref, inputs, watch)
+            return document, to_json(document), lasting
         except ImageFailure as failure:
-            document = self._error(ref, digests, failure.reason, failure.detail)
+            document = self._error(ref, inputs, failure.reason, failure.detail)
         except OSError as error:
             # The network or disk may answer tomorrow: without a mark the next run tries again.
             lasting = False
-            document = self._error(ref, digests, StatusReason.IMAGE_UNREADABLE, f"{ref.path}: {error}")
+            detail = f"{ref.path}: {error.strerror or type(error).__name__}"
+            document = self._error(ref, inputs, StatusReason.IMAGE_UNREADABLE, detail)
         except _BUGS as error:
-            document = self._error(ref, digests, StatusReason.INTERNAL_ERROR, _where(error))
-        watch.lap("curate")
-        write_atomically(self._setup.run_folder.document(ref.image_id), to_json(document))
-        watch.lap("write")
-        if lasting:
-            self._mark(ref, digests, watch)
-        return Outcome(ref.image_id, str(document["status"]), str(document["status_reason"]), watch.total())
+            document = self._error(ref, inputs, StatusReason.INTERNAL_ERROR, _where(error))
+        return document, to_json(document), lasting
 
-    def _document(self, ref: ImageRef, digests: dict[str, str | None], watch: Stopwatch) -> dict[str, Json]:
-        data = self._read(ref.path, digests)
+    def _document(self, ref: ImageRef, inputs: Inputs, watch: Stopwatch) -> dict[str, Json]:
+        data = inputs.data[ref.path]
         if data is None:
             raise ImageError(StatusReason.IMAGE_NOT_FOUND, f"{ref.path} is not there")
         raw = read_image(data, ref.path)
         watch.lap("read")
-        state, block, source = self._state(ref, raw, digests)
+        state, block, source = self._state(ref, raw, inputs)
         watch.lap("geometry")
-        stars = self._stars(ref, state, digests)
+        stars = self._stars(ref, state, inputs)
         watch.lap("catalog")
         navigation: Navigation = navigate(raw.pixels, _flags(raw, block), state, stars, self._options, watch.lap)
         rank = self._setup.configuration.orchestrator.rank
-        return build_metadata_dict(navigation, rank, self._provenance(ref, digests, source))
+        return build_metadata_dict(navigation, rank, self._provenance(ref, inputs, source))
 
-    def _read(self, path: str, digests: dict[str, str | None]) -> bytes | None:
-        try:
-            data = self._setup.archive.read(path)
-        except FileNotFoundError:
-            return None
-        digests[path] = hashlib.sha256(data).hexdigest()
-        return data
-
-    def _state(
-        self, ref: ImageRef, raw: RawImage, digests: dict[str, str | None]
-    ) -> tuple[State, InstrumentBlock | None, str]:
+    def _state(self, ref: ImageRef, raw: RawImage, inputs: Inputs) -> tuple[State, InstrumentBlock | None, str]:
         """Geometry from the sidecar where there is one (and it is allowed), else from the header."""
         description, blocks = self._setup.archive.description, self._setup.configuration.instruments
         block = blocks[description.instrument] if description.instrument else identify(raw.header, blocks)
         path = stem(ref.path) + SIDECAR_SUFFIX
-        sidecar = None if description.geometry == "header" else self._read(path, digests)
+        sidecar = inputs.data.get(path)
         if sidecar is not None:
-            return state_from_sidecar(sidecar, ref.image_id, block, description.settings), block, "sidecar"
+            shape = raw.pixels.shape
+            return state_from_sidecar(sidecar, ref.image_id, block, description.settings, shape), block, "sidecar"
         if description.geometry == "sidecar":
             raise GeometryError(StatusReason.GEOMETRY_MISSING, f"{path} is not there")
         if block is None:
@@ -152,12 +189,12 @@ class ImageRunner:
             )
         return state_from_header(raw, ref.image_id, block, description.settings), block, "header"
 
-    def _stars(self, ref: ImageRef, state: State, digests: dict[str, str | None]) -> StarTable:
+    def _stars(self, ref: ImageRef, state: State, inputs: Inputs) -> StarTable:
         axis, half = field_of_view(state.camera_model, reach_px(state))
         direction = state.attitude.camera_from_j2000.T @ axis
         tables = [seen_from(self._indexes, direction, half, state.et, state.spacecraft)]
         path = stem(ref.path) + STARS_SUFFIX
-        data = self._read(path, digests) if self._setup.per_image_stars else None
+        data = inputs.data.get(path)
         if data is not None:
             try:
                 tables.append(read_table(data, path, apparent=False))
@@ -165,26 +202,24 @@ class ImageRunner:
                 raise CatalogError(StatusReason.CATALOG_INVALID, str(error)) from error
         return StarTable.concatenate(tables)
 
-    def _provenance(self, ref: ImageRef, digests: Mapping[str, str | None], source: str | None) -> Provenance:
-        sidecar = digests.get(stem(ref.path) + SIDECAR_SUFFIX)
-        table = digests.get(stem(ref.path) + STARS_SUFFIX)
+    def _provenance(self, ref: ImageRef, inputs: Inputs, source: str | None) -> Provenance:
+        sidecar = inputs.digests.get(stem(ref.path) + SIDECAR_SUFFIX)
+        table = inputs.digests.get(stem(ref.path) + STARS_SUFFIX)
         catalogs = (*self._setup.star_digests, *((("per-image", table),) if table else ()))
-        image = digests[ref.path]
+        image = inputs.digests.get(ref.path)
         return Provenance(
             self._setup.software, self._config_digest, ref.path, image, source,
-            sidecar if source == "sidecar" else image, catalogs,
+            {"sidecar": sidecar, "header": image}.get(source or ""), catalogs,
         )  # fmt: skip
 
-    def _error(
-        self, ref: ImageRef, digests: Mapping[str, str | None], reason: StatusReason, detail: str
-    ) -> dict[str, Json]:
-        return error_document(ref.image_id, reason, detail, self._provenance(ref, digests, None))
+    def _error(self, ref: ImageRef, inputs: Inputs, reason: StatusReason, detail: str) -> dict[str, Json]:
+        return error_document(ref.image_id, reason, detail, self._provenance(ref, inputs, None))
 
-    def _mark(self, ref: ImageRef, digests: Mapping[str, str | None], watch: Stopwatch) -> None:
+    def _mark(self, ref: ImageRef, inputs: Inputs, document_sha256: str, watch: Stopwatch) -> None:
         """The mark comes after the document: a kill in between only makes the image be done again."""
         mark: dict[str, Json] = {
-            "task_id": self._setup.task_id(ref.image_id, digests), "inputs": input_marks(self._setup.archive, digests),
-            "timings": {**watch.seconds, "total": watch.total()},
+            "task_id": self._setup.task_id(ref.image_id, inputs.digests), "document_sha256": document_sha256,
+            "inputs": inputs.marks(), "timings": {**watch.seconds, "total": watch.total()},
         }  # fmt: skip
         write_atomically(self._setup.run_folder.mark(ref.image_id), to_json(mark))
 

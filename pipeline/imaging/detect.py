@@ -9,6 +9,9 @@ from pipeline.imaging.psf import PointSources, PointSpread, fit_point_sources
 from pipeline.options import Options
 from pipeline.records import BoolArray, FloatArray, Image
 
+# Half-width of the window in which a saturated star's blob is measured.
+_BLOB_REACH_PX = 20
+
 
 class DetectionOptions(Options):
     """Thresholds of the blind search."""
@@ -179,12 +182,15 @@ def star_like(fits: PointSources, spread: PointSpread, options: DetectionOptions
 
 def _centre_on_saturation(starts_vu: FloatArray, saturated: BoolArray) -> FloatArray:
     """Start at the middle of the saturated blob a start falls on; the filter's maximum there is arbitrary."""
-    if not len(starts_vu) or not saturated.any():
-        return starts_vu
-    _, labels, _, centroids = cv2.connectedComponentsWithStats(saturated.astype(np.uint8), connectivity=8)
     at = np.clip(np.rint(starts_vu).astype(int), 0, np.array(saturated.shape) - 1)
-    blob = labels[at[:, 0], at[:, 1]]
-    return np.where(blob[:, None] > 0, centroids[blob][:, ::-1], starts_vu)
+    moved = starts_vu.copy()
+    for row in np.flatnonzero(saturated[at[:, 0], at[:, 1]]):
+        low = np.maximum(at[row] - _BLOB_REACH_PX, 0)
+        window = saturated[low[0] : at[row, 0] + _BLOB_REACH_PX + 1, low[1] : at[row, 1] + _BLOB_REACH_PX + 1]
+        _, labels, _, centroids = cv2.connectedComponentsWithStats(window.astype(np.uint8), connectivity=8)
+        inside = tuple(at[row] - low)
+        moved[row] = centroids[labels[inside]][::-1] + low
+    return moved
 
 
 def _without_repeats(fits: PointSources, spread: PointSpread) -> PointSources:

@@ -51,7 +51,10 @@ def _long_runs(flags: BoolArray, length: int) -> BoolArray:
     if length > flags.shape[1]:
         return np.zeros_like(flags)
     bar = np.ones((1, length), np.uint8)
-    return np.asarray(cv2.morphologyEx(flags.astype(np.uint8), cv2.MORPH_OPEN, bar, borderValue=0), bool)
+    # Erosion and dilation by a bar of even length must be anchored at opposite ends, or every run moves by one pixel.
+    starts = cv2.erode(flags.astype(np.uint8), bar, anchor=(0, 0), borderType=cv2.BORDER_CONSTANT, borderValue=0)
+    whole = cv2.dilate(starts, bar, anchor=(length - 1, 0), borderType=cv2.BORDER_CONSTANT, borderValue=0)
+    return np.asarray(whole, bool)
 
 
 def saturated_pixels(image: Image, saturation_dn: float | None, read_noise_dn: float | None) -> BoolArray:

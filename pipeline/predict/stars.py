@@ -19,10 +19,10 @@ class StarPredictionOptions(Options):
     min_snr: float = Field(3.0, gt=0, description="expected signal to noise below which a star is not predicted")
     max_stars: int = Field(150, ge=1, le=2000, description="brightest stars kept")
     unknown_motion_masyr: float = Field(
-        12.0,
+        20.0,
         ge=0,
-        description="1-sigma proper motion per axis of a star whose catalogue gives none, mas/yr; the median |pm| of "
-        "the Hipparcos stars of magnitude 9-10 corresponds to it",
+        description="1-sigma proper motion per axis of a star whose catalogue gives none, mas/yr: what the Hipparcos "
+        "stars fainter than G = 9 show (robust sigma)",
     )
     place_sigma_mas: float = Field(2.0, ge=0, description="floor of a catalogue place's 1-sigma per axis, mas")
     centroid_floor_px: float = Field(

@@ -53,6 +53,9 @@ class NavContext(Record):
     max_rotation_deg: float
     search_margin_vu: tuple[float, float]
 
+    def __post_init__(self) -> None:
+        self._freeze(camera_from_j2000=(3, 3))
+
     @staticmethod
     def of(state: State) -> "NavContext":
         """Context of an image."""
@@ -223,7 +226,7 @@ def information_of(covariance: FloatArray) -> FloatArray:
     """
     known = np.diag(covariance) < ROTATION_UNOBSERVABLE_VARIANCE / 10
     block = covariance[np.ix_(known, known)]
-    if not np.isfinite(block).all() or (np.linalg.eigvalsh(block) <= 0).any():
+    if not np.isfinite(covariance).all() or (np.linalg.eigvalsh(block) <= 0).any():
         raise ContractError(f"covariance is not positive definite: {covariance.tolist()}")
     result = np.zeros_like(covariance)
     result[np.ix_(known, known)] = np.linalg.inv(block)
@@ -248,7 +251,8 @@ def covariance_of(information: FloatArray) -> FloatArray:
     known = values > 1e-12
     variance = np.where(known, 1.0 / np.where(known, values, 1.0), ROTATION_UNOBSERVABLE_VARIANCE)
     directions = vectors / scale[:, None]
-    directions[:, ~known] = vectors[:, ~known]
+    # A null direction keeps its sense in the parameters' own units; only its length is arbitrary.
+    directions[:, ~known] /= np.linalg.norm(directions[:, ~known], axis=0)
     return np.asarray((directions * variance) @ directions.T)
 
 

@@ -5,14 +5,12 @@ from pydantic import Field
 
 from pipeline.imaging.psf import PointSources
 from pipeline.predict.stars import PredictedStars
-from pipeline.records import FloatArray
 from pipeline.status import StatusReason
 from pipeline.techniques.base import NavContext, TechniqueFailure, TechniqueOptions, TechniqueResult, edge_flags
 from pipeline.techniques.star_fit import StarFit, StarFitOptions, fit_stars
-from pipeline.techniques.star_inventory import star_inventory
+from pipeline.techniques.star_inventory import pair_covariance, star_inventory
 from pipeline.techniques.star_match import (
     Hypothesis,
-    IntArray,
     MatchProblem,
     StarMatchOptions,
     chance_visible,
@@ -96,25 +94,6 @@ def _hypotheses(problem: MatchProblem, options: StarFieldOptions) -> list[Hypoth
         if not any(same_answer(hypothesis, other, reach) for other in distinct):
             distinct.append(hypothesis)
     return distinct
-
-
-def pair_covariance(stars: PredictedStars, sources: PointSources, star: IntArray, source: IntArray) -> FloatArray:
-    """Covariance of each matched pair: the centroid's and the catalogue place's.
-
-    Parameters
-    ----------
-    stars, sources
-        Predictions and detections.
-    star, source
-        (k,) indices.
-
-    Returns
-    -------
-    numpy.ndarray
-        (k, 2, 2) px^2.
-    """
-    place = stars.place_sigma_px[star] ** 2
-    return np.asarray(sources.covariance_vu[source] + place[:, None, None] * np.eye(2))
 
 
 def _result(

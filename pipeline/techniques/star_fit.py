@@ -240,6 +240,7 @@ def fit_stars(
         if extra == 0.0:
             break
     offset, theta = offset_between(camera, prior, attitude)
+    theta = theta if free == 3 else 0.0  # Several smallest rotations in a row leave a tiny twist.
     total = covariance_vu[inlier] + extra**2 * np.eye(2)
     pivot = weights @ predicted_vu[inlier] / weights.sum()
     about_pivot, _ = move_pivot(offset, theta, camera.centre_vu, pivot)

@@ -22,6 +22,25 @@ _FLUX_FACTOR = 3.0
 _CHANCE_NEIGHBOUR = 0.1
 
 
+def pair_covariance(stars: PredictedStars, sources: PointSources, star: IntArray, source: IntArray) -> FloatArray:
+    """Covariance of each matched pair: the centroid's and the catalogue place's.
+
+    Parameters
+    ----------
+    stars, sources
+        Predictions and detections.
+    star, source
+        (k,) indices.
+
+    Returns
+    -------
+    numpy.ndarray
+        (k, 2, 2) px^2.
+    """
+    place = stars.place_sigma_px[star] ** 2
+    return np.asarray(sources.covariance_vu[source] + place[:, None, None] * np.eye(2))
+
+
 def star_inventory(
     stars: PredictedStars,
     sources: PointSources,

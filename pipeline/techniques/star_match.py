@@ -177,8 +177,9 @@ def _cast_votes(predicted, centre, angles, measured, weight, margin_v, margin_u,
                     votes[k, int((off_v + margin_v) / cell), int((off_u + margin_u) / cell)] += weight[i, j]
 
 
-# A pattern with so many fewer votes (natural log of odds) than the best cannot be its rival.
+# A pattern with so many fewer votes (natural log of odds), or so small a share of them, is no rival of the best.
 _HOPELESS_VOTES = 25.0
+_RIVAL_SHARE = 0.4
 
 
 def search(problem: MatchProblem, ratio: FloatArray, options: StarMatchOptions) -> list[tuple[FloatArray, float]]:
@@ -215,27 +216,27 @@ def search(problem: MatchProblem, ratio: FloatArray, options: StarMatchOptions) 
         problem.predicted_vu, centre, angles, problem.measured_vu, weight, margin[0], margin[1], _CELL_PX, votes
     )
     best: list[tuple[FloatArray, float]] = []
-    maxima = _window_maxima(votes, options.hypotheses)
-    for k, v, u, _ in (m for m in maxima if m[3] >= maxima[0][3] - _HOPELESS_VOTES):
+    for k, v, u in _window_maxima(votes, options.hypotheses):
         offset = (np.array([v, u]) + 1.0) * _CELL_PX - margin
         best.append((offset, float(angles[k])))
     return best
 
 
-def _window_maxima(votes: NDArray[np.float32], count: int) -> list[tuple[int, int, int, float]]:
-    """Highest sums over 2x2 cells: first cell's index and sum, none within two cells and three angles of a higher."""
+def _window_maxima(votes: NDArray[np.float32], count: int) -> list[tuple[int, int, int]]:
+    """Highest sums over 2x2 cells (first cell's index), none within two cells and three angles of a higher one."""
     sums = np.stack([
         cv2.boxFilter(layer, -1, (2, 2), anchor=(0, 0), normalize=False, borderType=cv2.BORDER_CONSTANT)
         for layer in votes
     ])  # fmt: skip
     flat = sums.ravel()
-    pool = min(flat.size, 60 * count)
-    top = np.argpartition(flat, flat.size - pool)[flat.size - pool :]
+    # Nearly all cells are empty, so a threshold leaves few to sort; those below it are no rivals of the highest.
+    highest = float(flat.max())
+    top = np.flatnonzero(flat > max(highest - _HOPELESS_VOTES, _RIVAL_SHARE * highest, 0.0))
     top = top[np.lexsort((top, -flat[top]))]
-    found: list[tuple[int, int, int, float]] = []
+    found: list[tuple[int, int, int]] = []
     for k, v, u in zip(*np.unravel_index(top, sums.shape), strict=True):
-        if all(abs(k - a) > 3 or abs(v - b) > 2 or abs(u - c) > 2 for a, b, c, _ in found):
-            found.append((int(k), int(v), int(u), float(sums[k, v, u])))
+        if all(abs(k - a) > 3 or abs(v - b) > 2 or abs(u - c) > 2 for a, b, c in found):
+            found.append((int(k), int(v), int(u)))
             if len(found) == count:
                 break
     return found

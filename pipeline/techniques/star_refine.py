@@ -10,9 +10,8 @@ from pipeline.predict.stars import PredictedStars, near_array
 from pipeline.records import BoolArray, FloatArray
 from pipeline.status import StatusReason
 from pipeline.techniques.base import NavContext, TechniqueFailure, TechniqueOptions, TechniqueResult, edge_flags
-from pipeline.techniques.star_field import pair_covariance
 from pipeline.techniques.star_fit import StarFitOptions, fit_stars, predict_at
-from pipeline.techniques.star_inventory import star_inventory
+from pipeline.techniques.star_inventory import pair_covariance, star_inventory
 
 NAME = "StarRefineNav"
 

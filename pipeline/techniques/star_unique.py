@@ -9,12 +9,10 @@ from pydantic import Field
 from pipeline.geometry.procrustes import pair_rotation
 from pipeline.imaging.psf import PointSources
 from pipeline.predict.stars import PredictedStars
-from pipeline.records import FloatArray
 from pipeline.status import StatusReason
 from pipeline.techniques.base import NavContext, TechniqueFailure, TechniqueOptions, TechniqueResult, edge_flags
-from pipeline.techniques.star_field import pair_covariance
 from pipeline.techniques.star_fit import StarFitOptions, fit_stars
-from pipeline.techniques.star_inventory import star_inventory
+from pipeline.techniques.star_inventory import pair_covariance, star_inventory
 from pipeline.techniques.star_match import (
     Hypothesis,
     IntArray,
@@ -34,6 +32,12 @@ from pipeline.techniques.star_match import (
 NAME = "StarUniqueMatchNav"
 # Of the detection pairs with the right separation, those whose brightness fits best; the others cannot win.
 _MOST_PAIRS = 30
+# Other stars this likely to be detected, this far inside the array, are asked; this near, a detection is theirs.
+_SURELY_DETECTED = 0.85
+_EDGE_PX = 4.0
+_PRESENT_PX = 1.5
+# Lost lines, variables and companions may hide some of them.
+_PRESENT_SHARE = 0.7
 
 
 class StarUniqueOptions(TechniqueOptions):
@@ -81,7 +85,7 @@ def star_unique_nav(
     if not len(sources):
         return TechniqueFailure(NAME, StatusReason.NO_FEATURES_DETECTED, "no point sources detected")
     kept = sources.take(np.arange(min(len(sources), options.max_sources)))
-    everything = match_problem(stars, kept, detection_sigma, context, options.match)
+    everything = match_problem(stars, sources, detection_sigma, context, options.match)
     # The brightest star does not help while it is off the array, wherever within the margin the camera points.
     index = np.flatnonzero(chance_visible(everything) >= options.min_visible)[: options.brightest]
     if not len(index):
@@ -98,7 +102,9 @@ def star_unique_nav(
         best_chance = max(best_chance, float(probability[0]))
         if probability[0] >= threshold:
             best = replace(hypotheses[0], star=index[hypotheses[0].star])
-            return _result(stars, sources, best, float(probability[0]), context, options)
+            if _others_present(everything, best):
+                return _result(stars, sources, best, float(probability[0]), context, options)
+            return TechniqueFailure(NAME, StatusReason.AMBIGUOUS_MATCH, "the other bright stars contradict the match")
     return TechniqueFailure(
         NAME, StatusReason.AMBIGUOUS_MATCH, f"no unmistakable star, best probability {best_chance:.4f}"
     )
@@ -138,18 +144,12 @@ def _pair_hypothesis(
 
 
 def _singles(problem: MatchProblem, ratio: np.ndarray, options: StarUniqueOptions) -> list[Hypothesis]:
-    """The brightest star on every detection within the margin where it is the only star to be expected.
-
-    A second star in the field makes a lone match either a pair or a sign that something is wrong (the star has a
-    companion, or is not where the catalogue puts it), and one star cannot tell which.
-    """
+    """The brightest star on every detection within the margin."""
     found: list[Hypothesis] = []
     star = np.array([0])
     for j in range(len(problem.measured_vu)):
         source = np.array([j])
         offset, _ = similarity(problem, star, source)
-        if _others_expected(problem, offset):
-            continue
         log_odds = assignment_log_odds(problem, ratio, star, source, offset, 0.0, options.match, considered=star)
         if np.isfinite(log_odds):
             found.append(Hypothesis(star, source, offset, 0.0, log_odds))
@@ -157,11 +157,21 @@ def _singles(problem: MatchProblem, ratio: np.ndarray, options: StarUniqueOption
     return found
 
 
-def _others_expected(problem: MatchProblem, offset_vu: FloatArray) -> bool:
-    """Whether a second bright star should be on the array under this offset, at any rotation near zero."""
-    seen = transform(problem, offset_vu, 0.0)[1:]
-    inside = ((seen > -0.5) & (seen < np.array(problem.shape_vu) - 0.5)).all(axis=1)
-    return bool((inside & (problem.chance_detected[1:] > 0.5)).any())
+def _others_present(everything: MatchProblem, best: Hypothesis) -> bool:
+    """Whether the other stars that must be on the array under an assignment have detections at their places.
+
+    One or two stars cannot tell that one of them has moved or has a companion; the rest of the field can. A lone match
+    knows no rotation, so it stands only where no other star is to be expected.
+    """
+    seen = transform(everything, best.offset_vu, best.rotation_rad)
+    surely = everything.chance_detected > _SURELY_DETECTED
+    surely[best.star] = False
+    inner = (seen > _EDGE_PX).all(axis=1) & (seen < np.array(everything.shape_vu) - 1 - _EDGE_PX).all(axis=1)
+    others = seen[surely & inner]
+    if not len(others) or len(best.star) == 1:
+        return not len(others)
+    gap = np.abs(everything.measured_vu[None, :, :] - others[:, None, :]).max(axis=2).min(axis=1)
+    return bool(np.mean(gap <= _PRESENT_PX) >= _PRESENT_SHARE)
 
 
 def _distinct(found: list[Hypothesis], problem: MatchProblem) -> list[Hypothesis]:

@@ -28,8 +28,11 @@ GAIA_EPOCH = 2016.0
 HIPPARCOS_EPOCH = 1991.25
 MATCH_RADIUS_RAD = 1500.0 * MAS
 """Largest distance between the same star in both catalogues at the Gaia epoch."""
-MATCH_MAGNITUDES = 1.5
-"""Largest difference |Hp - G| of the same star; the bands differ by less for all but the reddest stars."""
+MATCH_MAGNITUDES = 2.5
+"""Largest difference |Hp - G| of the same star; the reddest giants and dwarfs come near it."""
+HIDDEN_MOTION_MASYR = 20.0
+"""Sigma per axis of the motion of stars for which no catalogue gives one: that of Hipparcos stars fainter than G = 9."""
+HIDDEN_MOTION_SEED = 20
 
 _GAIA_ROW = np.dtype(
     [("id", "<i8"), ("ra", "<f8"), ("dec", "<f8"), ("g", "<f4"), ("bp", "<f4"), ("rp", "<f4")]
@@ -200,4 +203,9 @@ def read_real_sky() -> RealSky:
     for name in ("ra_deg", "dec_deg", "epoch"):
         columns[name][borrowed] = getattr(hipparcos, name)[rows[borrowed]]
     columns["parallax_mas"] = np.maximum(columns["parallax_mas"], 0.0)
+    # A star whose motion nobody has listed moves all the same, and so is not quite where its catalogue puts it.
+    unlisted = np.flatnonzero(rows < 0)
+    rng = np.random.default_rng(HIDDEN_MOTION_SEED)
+    for name in ("pm_ra_masyr", "pm_dec_masyr"):
+        columns[name][unlisted] = HIDDEN_MOTION_MASYR * rng.standard_normal(len(unlisted))
     return RealSky(Stars(**columns), tree)
