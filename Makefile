@@ -3,7 +3,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 DEMO := outputs/demo
 
-.PHONY: install demo test quick check bench clean
+.PHONY: install demo test quick check bench bench-dask clean
 
 install: $(VENV)/installed
 
@@ -29,6 +29,9 @@ quick: install
 check: install
 	$(BIN)/ruff check .
 	$(BIN)/mypy
+
+bench-dask: install
+	$(BIN)/python -m workflows.bench_dask
 
 bench: install
 	$(BIN)/python -m workflows.bench

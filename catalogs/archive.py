@@ -5,7 +5,7 @@ import posixpath
 import re
 import zipfile
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -189,8 +189,8 @@ def open_archive(url: str, overrides: Mapping[str, object]) -> Archive:
         raise ConfigurationError(f"archive {url}: {error}") from error
     try:
         content = None if text is None else yaml.safe_load(text)
-    except (yaml.YAMLError, RecursionError) as error:
-        raise ConfigurationError(f"{url}/{name} is not YAML: {error}") from error
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        raise ConfigurationError(f"{url}/{name} is not YAML: {' '.join(str(error).split())}") from error
     if text is None and "images" not in overrides:
         raise ConfigurationError(f"{url} has no {name}; write one, or say {_OVERRIDE}images='*.fits'")
     content = {} if content is None else content
@@ -243,7 +243,8 @@ def list_images(archive: Archive, blocks: Mapping[str, InstrumentBlock]) -> list
     patterns = [_inside(pattern) for pattern in ([patterns] if isinstance(patterns, str) else patterns)]
     fs, root = _filesystem(archive.url)
     # Some file systems list names with a leading slash below an empty root, some without.
-    every = sorted(path.removeprefix(root).lstrip("/") for path in fs.find(root))
+    files = _walk(root or "/", frozenset()) if isinstance(fs, LocalFileSystem) else fs.find(root)
+    every = sorted(path.removeprefix(root).lstrip("/") for path in files)
     known = set(every)
     found: dict[str, bool] = {}
     for pattern in patterns:
@@ -257,6 +258,19 @@ def list_images(archive: Archive, blocks: Mapping[str, InstrumentBlock]) -> list
     refs = [ImageRef(_image_id(path, archive, known, blocks), path, exists) for path, exists in found.items()]
     _refuse_ids(refs)
     return sorted(refs, key=lambda ref: ref.image_id)
+
+
+def _walk(folder: str, above: frozenset[str]) -> Iterator[str]:
+    """Files of a local folder; linked folders are entered, which fsspec does not do, but no circle is."""
+    real = os.path.realpath(folder)
+    if real in above:
+        return
+    with os.scandir(folder) as entries:
+        for entry in entries:
+            if entry.is_dir():
+                yield from _walk(entry.path, above | {real})
+            else:
+                yield entry.path
 
 
 def _inside(pattern: str) -> str:

@@ -193,9 +193,15 @@ def first_problem(error: ValidationError) -> str:
     str
         ``key: what is wrong``.
     """
-    problem = error.errors(include_url=False)[0]
-    where = ".".join(map(str, problem["loc"])) or "document"
+    # Of alternatives the one that got furthest is the one that was meant.
+    problem = max(error.errors(include_url=False), key=lambda problem: len(problem["loc"]))
+    where = ".".join(str(part) for part in problem["loc"] if not _is_alternative(part)) or "document"
     return f"{where}: {problem['msg']}"
+
+
+def _is_alternative(part: int | str) -> bool:
+    """Whether a step of a problem's place is pydantic's name for one of several types."""
+    return isinstance(part, str) and (part in ("str", "StarTableRef") or "[" in part)
 
 
 def _sidecar_camera(

@@ -12,6 +12,7 @@ from io import BytesIO
 
 import numpy as np
 from astropy.io import fits
+from astropy.io.fits.hdu.compressed._compression import CfitsioException
 from astropy.io.fits.verify import VerifyError, VerifyWarning
 from astropy.utils.exceptions import AstropyUserWarning
 
@@ -24,7 +25,7 @@ _BLOCK = 2880
 # What astropy lets through when a file is damaged.
 _DAMAGE = (
     OSError, ValueError, TypeError, LookupError, AttributeError, ArithmeticError, VerifyError, MemoryError, EOFError,
-    struct.error, zlib.error,
+    struct.error, zlib.error, CfitsioException,
 )  # fmt: skip
 
 
@@ -97,6 +98,8 @@ def read_image(data: bytes, name: str) -> RawImage:
     if not data.startswith(b"SIMPLE  ="):
         start = data[:8]
         raise ImageError(StatusReason.IMAGE_FORMAT_UNKNOWN, f"{name} is not a FITS file: it starts with {start!r}")
+    if len(data) < _BLOCK:
+        raise ImageError(StatusReason.IMAGE_TRUNCATED, f"{name} ends inside its header")
     with _forgiving(name):
         return _read_fits(data, name)
 
@@ -124,6 +127,7 @@ def _read_fits(data: bytes, name: str) -> RawImage:
         raise ImageError(StatusReason.IMAGE_UNREADABLE, f"{name} holds no two-dimensional image")
     for hdu in hdus:
         _check_length(hdu, len(data), name)
+    _check_rest(hdus, data, name)
     extensions = {
         hdu.name.upper(): partial(_pixels_of, hdu, name)
         for hdu in hdus
@@ -150,6 +154,16 @@ def _check_length(hdu: fits.PrimaryHDU, length: int, name: str) -> None:
     if end > length:
         share = length / end
         raise ImageError(StatusReason.IMAGE_TRUNCATED, f"{name} has {length} bytes of {end} ({share:.0%})")
+
+
+def _check_rest(hdus: fits.HDUList, data: bytes, name: str) -> None:
+    """Bytes after the last unit may be anything, but not an extension that astropy has given up on."""
+    info = hdus[-1].fileinfo()
+    rest = data[info["datLoc"] + info["datSpan"] :]
+    if rest.startswith(b"XTENSION"):
+        whole = len(rest) >= _BLOCK and len(data) % _BLOCK == 0
+        reason = StatusReason.IMAGE_UNREADABLE if whole else StatusReason.IMAGE_TRUNCATED
+        raise ImageError(reason, f"{name}: the header of extension {len(hdus)} is damaged or cut off")
 
 
 def _data_bytes(header: fits.Header) -> int:

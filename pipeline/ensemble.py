@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from pydantic import Field
 from scipy.linalg import pinvh
-from scipy.stats import chi2 as chi2_distribution
+from scipy.special import chdtri
 
 from pipeline.geometry.pointing import move_pivot
 from pipeline.options import Options
@@ -191,7 +191,7 @@ def _clusters(placed: list[_Placed], options: EnsembleOptions) -> list[list[_Pla
     for i in range(len(placed)):
         for j in range(i):
             distance2, rank = _distance2(placed[i], placed[j])
-            if rank == 0 or distance2 <= float(chi2_distribution.isf(options.link_chance, rank)):
+            if rank == 0 or distance2 <= float(chdtri(rank, options.link_chance)):
                 old, new = label[i], label[j]
                 label = [new if entry == old else entry for entry in label]
     return [[p for p, mine in zip(placed, label, strict=True) if mine == key] for key in dict.fromkeys(label)]

@@ -125,9 +125,10 @@ def make_frame(pixels: Image, flagged: BoolArray | None, state: State, options: 
     image = image - background.level
     image[unusable & ~saturated] = 0.0
     noise = float(np.median(background.tile_sigma))
+    image_class = _classify(background, replace(detector, gain_e_per_dn=gain), noise, floor, options)
     return Frame(
         pixels=image, sigma=background.sigma, bad=bad, saturated=saturated, gain_e_per_dn=gain,
-        spread=point_spread(state, options), image_class=_classify(background, detector, noise, floor, options),
+        spread=point_spread(state, options), image_class=image_class,
         background_dn=float(np.median(background.tile_level)), noise_dn=noise,
         missing_share=_share(missing), saturated_share=_share(saturated),
     )  # fmt: skip

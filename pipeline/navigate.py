@@ -14,7 +14,7 @@ from pipeline.options import Options
 from pipeline.predict.stars import PredictedStars, StarPredictionOptions, predict_stars
 from pipeline.records import BoolArray, FloatArray, Image, StarTable, State
 from pipeline.status import StatusReason
-from pipeline.techniques.base import NavContext, TechniqueFailure, TechniqueResult
+from pipeline.techniques.base import NavContext, Prior, TechniqueFailure, TechniqueResult
 from pipeline.techniques.star_field import StarFieldOptions, star_field_nav
 from pipeline.techniques.star_refine import StarRefineOptions, star_refine_nav
 from pipeline.techniques.star_unique import StarUniqueOptions, star_unique_nav
@@ -151,12 +151,8 @@ def _second_pass(
     refine = options.techniques.StarRefineNav
     if not refine.enabled:
         return []
-    return [
-        star_refine_nav(
-            predicted, frame, prior.offset_vu, prior.rotation_rad or 0.0, prior.covariance, prior.confidence, context,
-            options.detection, refine,
-        )
-    ]  # fmt: skip
+    start = Prior(prior.offset_vu, prior.rotation_rad or 0.0, prior.covariance, prior.confidence)
+    return [star_refine_nav(predicted, frame, start, context, options.detection, refine)]
 
 
 def _fuse(

@@ -8,7 +8,6 @@ different machines (or of a machine whose speed drifts) can be compared.
 import json
 import multiprocessing
 import os
-import resource
 import statistics
 import tempfile
 import time
@@ -167,9 +166,21 @@ def time_case(archive: Path, run_folder: Path) -> Figures:
         runner.run(ref)
         seconds.append(time.perf_counter() - start)
     low, middle, high = np.quantile(seconds, (0.25, 0.5, 0.75))
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
     statuses = sorted({outcome.status for outcome in outcomes})
-    return Figures(float(middle), float(low), float(high), peak, "+".join(statuses))
+    return Figures(float(middle), float(low), float(high), peak_memory_mb(), "+".join(statuses))
+
+
+def peak_memory_mb() -> float:
+    """Peak resident memory of this process, MB.
+
+    Returns
+    -------
+    float
+        VmHWM; ``getrusage`` would count the parent's memory at the moment of the fork.
+    """
+    text = Path("/proc/self/status").read_text()
+    line = next(line for line in text.splitlines() if line.startswith("VmHWM:"))
+    return int(line.split()[1]) / 1024.0
 
 
 def floor_seconds() -> float:

@@ -43,6 +43,7 @@ app.add_typer(catalog_cli.app, name="catalog")
 
 _ARCHIVE_KEY = "archive."
 _LOG_EVERY_S = 5.0
+_LOG_WIDTH = 130
 _PIPE_WIDTH = 400
 
 ArchiveArg = Annotated[str, typer.Argument(help="Folder or URL with an archive.yaml, or the path of one.")]
@@ -194,7 +195,7 @@ def show(
     limit: Annotated[int, typer.Option(min=1, help="Most rows shown.")] = 40,
 ) -> None:
     """Show outcome counts, one image, or a run against planted truth."""
-    folder, console = RunFolder(run_folder), Console()
+    folder, console = RunFolder(run_folder), _console()
     if not console.is_terminal:
         # A pipe has no width; what reads it should get whole rows.
         console.width = _PIPE_WIDTH
@@ -208,6 +209,12 @@ def show(
     print_counts(console, table)
     if truth is not None:
         print_comparison(console, *compare(table, read_truth(truth)), limit)
+
+
+def _console() -> Console:
+    """The terminal's width where there is one; in a pipe or a log, wide enough for every table."""
+    console = Console()
+    return console if console.is_terminal else Console(width=_LOG_WIDTH)
 
 
 @app.command()

@@ -102,7 +102,7 @@ def _shipped() -> Iterator[tuple[str, str]]:
 def _parse(text: str, source: str) -> Tree:
     try:
         content = yaml.safe_load(text)
-    except yaml.YAMLError as error:
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
         raise ConfigurationError(f"{source} is not YAML: {' '.join(str(error).split())}") from error
     if content is None:
         return {}
@@ -135,7 +135,7 @@ def parse_setting(setting: str) -> Tree:
         raise ConfigurationError(f"{_COMMAND_LINE} {setting}: say KEY=VALUE, for example detection.threshold_sigma=6")
     try:
         tree: object = yaml.safe_load(value)
-    except yaml.YAMLError as error:
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
         raise ConfigurationError(f"{_COMMAND_LINE} {setting}: the value is not YAML") from error
     for part in reversed(parts):
         tree = {part: tree}

@@ -16,9 +16,9 @@ _HEAD = """# Outputs
 
 | path | what |
 |---|---|
-| `images/<id>.json` | one document per image: answer, covariance, corrected pointing, every technique with its inventory of features, provenance |
+| `images/<id>.json` | per image: answer, covariance, corrected pointing, every technique's features, provenance |
 | `offsets/`, `techniques/`, `features/`, `timings/` | Parquet datasets, partitioned by mission and camera |
-| `state/<id>.json` | what an image was made from (sizes, times, sha256) and its timings: the marks by which a run resumes |
+| `state/<id>.json` | what an image was made from (sizes, times, sha256) and its timings: marks for resuming |
 | `plan.json`, `run.json` | images of the latest run; versions, configuration, catalogues, counts, start and end |
 
 Every file is written under a temporary name and renamed. Two runs on the same input compare equal byte for byte,

@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import duckdb
 import numpy as np
@@ -135,7 +136,10 @@ def compare(table: pd.DataFrame, truth: Mapping[str, Mapping[str, float]]) -> tu
     return joined, agreement
 
 
-_COMPARISON = ("image", "outcome", "planted dv, du", "recovered dv, du", "error", "sigma", "rotation planted, found")
+# Columns of the comparison and their widths; only the image's id gives way on a narrow terminal.
+_COMPARISON = {
+    "image": 6, "outcome": 9, "planted dv, du": 15, "found dv, du": 17, "error": 6, "sigma": 6, "rotation, found": 15,
+}  # fmt: skip
 
 
 def _comparison_row(row: Mapping[str, float | str]) -> list[str]:
@@ -165,10 +169,13 @@ def print_comparison(console: Console, joined: pd.DataFrame, agreement: Agreemen
     limit
         Most rows shown.
     """
-    table = Table(title="recovered against planted (pixels at the array centre)", title_justify="left")
-    for name in _COMPARISON:
-        table.add_column(name, justify="left" if name in _COMPARISON[:2] else "right", no_wrap=True)
-    for row in joined.head(limit).to_dict("records"):
+    table = Table(title="found against planted: pixels at the array centre, degrees", title_justify="left", box=None)
+    for name, width in _COMPARISON.items():
+        justify: Literal["left", "right"] = "left" if name in ("image", "outcome") else "right"
+        table.add_column(name, justify=justify, no_wrap=True, min_width=width, overflow="ellipsis")
+    # Ids sort by camera: rows from all over say more than the first ones.
+    chosen = np.unique(np.linspace(0, max(len(joined) - 1, 0), min(limit, len(joined))).astype(int))
+    for row in joined.iloc[chosen].to_dict("records"):
         table.add_row(*_comparison_row({str(key): value for key, value in row.items()}))
     console.print(table)
     if len(joined) > limit:

@@ -3,8 +3,8 @@
 from dataclasses import dataclass
 
 import cv2
-import numba
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
 from pipeline.options import Options
@@ -14,13 +14,15 @@ from pipeline.records import BoolArray, FloatArray, Image
 _QUANTILES = (0.158655, 0.5, 0.841345)
 # A tile with fewer valid samples says nothing and takes its neighbours' values.
 _MIN_TILE_SAMPLES = 24
+# Tiles' noise figures scatter by a few per cent: within this factor they are one figure.
+_EVEN_NOISE = 1.35
 
 
 class BackgroundOptions(Options):
     """How finely the background is followed."""
 
     tile_px: int = Field(64, ge=8, le=1024, description="side of a tile, pixels")
-    stride_px: int = Field(4, ge=1, le=16, description="spacing of the samples inside a tile, pixels")
+    samples_per_side: int = Field(16, ge=6, le=64, description="samples along each side of a tile")
 
 
 @dataclass(frozen=True)
@@ -41,29 +43,27 @@ class Background:
     tile_sigma: FloatArray
 
 
-@numba.njit(cache=True, nogil=True)
-def _tile_quantiles(image, bad, edges_v, edges_u, stride, quantiles, out):  # type: ignore[no-untyped-def]
-    longest_v, longest_u = np.diff(edges_v).max(), np.diff(edges_u).max()
-    sample = np.empty((longest_v // stride + 1) * (longest_u // stride + 1), dtype=np.float32)
-    for i in range(len(edges_v) - 1):
-        for j in range(len(edges_u) - 1):
-            count = 0
-            for v in range(edges_v[i], edges_v[i + 1], stride):
-                for u in range(edges_u[j], edges_u[j + 1], stride):
-                    if not bad[v, u]:
-                        sample[count] = image[v, u]
-                        count += 1
-            if count < _MIN_TILE_SAMPLES:
-                out[i, j, :] = np.nan
-                continue
-            ordered = np.sort(sample[:count])
-            out[i, j, 0] = ordered[0]
-            for k in range(len(quantiles)):
-                out[i, j, k + 1] = ordered[int(quantiles[k] * (count - 1) + 0.5)]
+def _sample_positions(length: int, tile: int, samples: int) -> NDArray[np.int64]:
+    """(tiles, samples) positions along an axis, evenly spread over each tile."""
+    edges = np.linspace(0, length, max(1, round(length / tile)) + 1)
+    share = (np.arange(samples) + 0.5) / samples
+    return (edges[:-1, None] + np.diff(edges)[:, None] * share).astype(np.int64)
 
 
-def _edges(length: int, tile: int) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
-    return np.linspace(0, length, max(1, round(length / tile)) + 1).astype(np.int64)
+def _tile_quantiles(image: Image, bad: BoolArray, options: BackgroundOptions) -> tuple[FloatArray, FloatArray]:
+    """(tiles v, tiles u) lowest valid sample, and (3, tiles v, tiles u) quantiles; NaN where too few are valid."""
+    rows = _sample_positions(image.shape[0], options.tile_px, options.samples_per_side)
+    cols = _sample_positions(image.shape[1], options.tile_px, options.samples_per_side)
+    at = np.ix_(rows.ravel(), cols.ravel())
+    shape = (len(rows), options.samples_per_side, len(cols), options.samples_per_side)
+    samples = np.where(bad[at], np.float32(np.nan), image[at]).reshape(shape).transpose(0, 2, 1, 3)
+    # Not-a-number sorts last, so the valid samples of a tile are its first ones.
+    ordered = np.sort(samples.reshape(len(rows), len(cols), -1), axis=2)
+    count = np.count_nonzero(np.isfinite(ordered), axis=2)
+    usable = count >= _MIN_TILE_SAMPLES
+    index = np.rint(np.multiply.outer(_QUANTILES, np.maximum(count - 1, 0))).astype(np.int64)
+    picked = np.take_along_axis(ordered[None], index[..., None], axis=3)[..., 0].astype(float)
+    return np.where(usable, ordered[:, :, 0], np.nan), np.where(usable, picked, np.nan)
 
 
 def _fill_gaps(values: FloatArray) -> FloatArray:
@@ -106,10 +106,7 @@ def estimate_background(
         Level and noise.
     """
     rows, cols = image.shape
-    edges_v, edges_u = _edges(rows, options.tile_px), _edges(cols, options.tile_px)
-    out = np.empty((len(edges_v) - 1, len(edges_u) - 1, 4))
-    _tile_quantiles(image, bad, edges_v, edges_u, options.stride_px, np.array(_QUANTILES), out)
-    lowest, low, middle, high = np.moveaxis(out, 2, 0)
+    lowest, (low, middle, high) = _tile_quantiles(image, bad, options)
     clipped = low <= lowest
     sigma = np.where(clipped, high - middle, middle - low)
     level, sigma = _fill_gaps(middle), _fill_gaps(sigma)
@@ -117,6 +114,8 @@ def estimate_background(
     # Neighbouring tiles share their noise; the median over 3x3 of them steadies a figure from a few hundred samples.
     steady = cv2.medianBlur(sigma.astype(np.float32), 3) if min(sigma.shape) >= 3 else sigma
     sigma = np.maximum(steady, np.sqrt(noise_floor_dn**2 + shot))
+    if sigma.max() <= _EVEN_NOISE * sigma.min():
+        sigma = np.full_like(sigma, np.median(sigma))
     return Background(_spread(level, (rows, cols)), _spread(sigma, (rows, cols)), level, sigma)
 
 

@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 from pydantic import Field
-from scipy.stats import chi2 as chi2_distribution
+from scipy.special import chdtri
 
 from pipeline.imaging.psf import PointSources, PointSpread, fit_point_sources
 from pipeline.options import Options
@@ -67,7 +67,9 @@ def matched_filter_snr(image: Image, bad: BoolArray, sigma: Image, spread: Point
     numpy.ndarray
         (rows, cols) float32.
     """
-    clean = np.divide(image, sigma, dtype=np.float32)
+    lowest, highest, _, _ = cv2.minMaxLoc(sigma)
+    # Noise is the same everywhere in most frames, and a product is four times as fast as a quotient of images.
+    clean = image * np.float32(1.0 / lowest) if lowest == highest else np.divide(image, sigma, dtype=np.float32)
     clean[bad] = 0.0
     kernel = kernel_of(spread)
     if spread.trail_px == 0.0:
@@ -174,7 +176,7 @@ def star_like(fits: PointSources, spread: PointSpread, options: DetectionOptions
         (n,) flags.
     """
     dof = np.maximum(fits.dof, 1)
-    limit = chi2_distribution.isf(options.shape_chance, dof)
+    limit = chdtri(dof, options.shape_chance)
     # A misfit of a given share of the star's light grows with the square of its signal to noise.
     allowed = limit + (spread.misfit * fits.snr) ** 2
     return np.asarray((fits.chi2 <= allowed) & (fits.snr > 0))

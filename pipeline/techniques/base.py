@@ -178,6 +178,29 @@ class TechniqueResult(Record):
         return covariance_of(self.information)
 
 
+@dataclass(frozen=True, eq=False)
+class Prior(Record):
+    """What a refiner starts from: the first ensemble's answer at the array centre.
+
+    Attributes
+    ----------
+    offset_vu, rotation_rad
+        Pointing.
+    covariance
+        (2, 2) or (3, 3), px^2 and rad^2.
+    confidence
+        A refiner cannot be surer of the identification than its seed.
+    """
+
+    offset_vu: FloatArray
+    rotation_rad: float
+    covariance: FloatArray
+    confidence: float
+
+    def __post_init__(self) -> None:
+        self._freeze(offset_vu=(2,), covariance=(len(self.covariance), len(self.covariance)))
+
+
 @dataclass(frozen=True)
 class TechniqueFailure:
     """A technique that ran and has no answer."""

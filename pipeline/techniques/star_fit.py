@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from pydantic import Field
-from scipy.stats import chi2 as chi2_distribution
+from scipy.special import chdtri
 
 from pipeline.camera import project
 from pipeline.geometry.pointing import corrected_attitude, move_pivot, offset_between
@@ -14,7 +14,7 @@ from pipeline.options import Options
 from pipeline.records import BoolArray, FloatArray
 from pipeline.techniques.base import NavContext
 
-_MEDIAN_CHI2_2DOF = float(chi2_distribution.median(2))
+_MEDIAN_CHI2_2DOF = 2.0 * np.log(2.0)
 # Re-prediction with the corrected attitude converges by the square of the field's size: a few rounds settle it.
 _ROUNDS = 5
 _SETTLED_PX = 1e-6
@@ -164,7 +164,7 @@ def _reject(
     ``predicted_vu`` is under an attitude close to the answer, so that a similarity in the image plane is exact enough.
     """
     inlier = np.ones(len(predicted_vu), bool)
-    limit = float(chi2_distribution.isf(options.outlier_chance, 2))
+    limit = float(chdtri(2, options.outlier_chance))
     turns, centre = context.fit_camera_rotation, context.camera_model.centre_vu
     weights = _weights(covariance + options.model_floor_px**2 * np.eye(2))
     while inlier.sum() > (3 if turns else 2):

@@ -203,7 +203,8 @@ def search(problem: MatchProblem, ratio: FloatArray, options: StarMatchOptions) 
     rows, cols = problem.shape_vu
     margin = np.asarray(context.search_margin_vu) + _CELL_PX
     half_diagonal = np.hypot(rows, cols) / 2
-    count = int(np.ceil(2 * context.max_rotation_rad * half_diagonal / _CELL_PX)) | 1
+    # Between two angles the outermost star moves by one and a half cells, at most half of that from the nearer one.
+    count = int(np.ceil(2 * context.max_rotation_rad * half_diagonal / (1.5 * _CELL_PX))) | 1
     angles = np.linspace(-context.max_rotation_rad, context.max_rotation_rad, count)
     # A pair's vote is its log-odds inside one window, so rare bright pairs outweigh common faint ones.
     window_area = (2 * _CELL_PX) ** 2

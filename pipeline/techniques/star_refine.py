@@ -9,7 +9,7 @@ from pipeline.imaging.psf import PointSources, fit_point_sources
 from pipeline.predict.stars import PredictedStars, near_array
 from pipeline.records import BoolArray, FloatArray
 from pipeline.status import StatusReason
-from pipeline.techniques.base import NavContext, TechniqueFailure, TechniqueOptions, TechniqueResult, edge_flags
+from pipeline.techniques.base import NavContext, Prior, TechniqueFailure, TechniqueOptions, TechniqueResult, edge_flags
 from pipeline.techniques.star_fit import StarFitOptions, fit_stars, predict_at
 from pipeline.techniques.star_inventory import pair_covariance, star_inventory
 
@@ -29,10 +29,7 @@ class StarRefineOptions(TechniqueOptions):
 def star_refine_nav(
     stars: PredictedStars,
     frame: Frame,
-    prior_offset_vu: FloatArray,
-    prior_rotation_rad: float,
-    prior_covariance: FloatArray,
-    confidence: float,
+    prior: Prior,
     context: NavContext,
     detection: DetectionOptions,
     options: StarRefineOptions,
@@ -45,10 +42,8 @@ def star_refine_nav(
         Predictions, all of them.
     frame
         Image.
-    prior_offset_vu, prior_rotation_rad, prior_covariance
-        First ensemble's answer at the array centre; (2, 2) or (3, 3).
-    confidence
-        Its confidence: a refiner cannot be surer of the identification than its seed.
+    prior
+        First ensemble's answer.
     context
         Camera, attitude, bounds.
     detection
@@ -61,8 +56,8 @@ def star_refine_nav(
     TechniqueResult or TechniqueFailure
         About the weighted centroid of the inliers. One surviving star leaves the rotation unobservable.
     """
-    expected = predict_at(context, stars.direction, prior_offset_vu, prior_rotation_rad)
-    gate = _gate(expected, stars.place_sigma_px, prior_covariance, context, options)
+    expected = predict_at(context, stars.direction, prior.offset_vu, prior.rotation_rad)
+    gate = _gate(expected, stars.place_sigma_px, prior.covariance, context, options)
     wanted = np.flatnonzero(near_array(expected, context.camera_model, (-1.0, -1.0)) & (gate <= options.gate_limit_px))
     wanted = wanted[_apart(expected[wanted], frame.spread.sigma_px)]
     fits = fit_point_sources(
@@ -73,7 +68,7 @@ def star_refine_nav(
     good = fits.ok & star_like(fits, frame.spread, detection) & (fits.snr >= options.min_snr) & (miss <= gate[wanted])
     if not good.any():
         return TechniqueFailure(NAME, StatusReason.NO_FEATURES_DETECTED, "no star inside the prior's gate")
-    return _result(stars, fits.take(np.flatnonzero(good)), wanted[good], confidence, context, options)
+    return _result(stars, fits.take(np.flatnonzero(good)), wanted[good], prior.confidence, context, options)
 
 
 def _gate(

@@ -7,6 +7,7 @@ import numpy as np
 from pydantic import Field
 
 from pipeline.geometry.procrustes import pair_rotation
+from pipeline.geometry.rotations import plane_rotation
 from pipeline.imaging.psf import PointSources
 from pipeline.predict.stars import PredictedStars
 from pipeline.status import StatusReason
@@ -138,7 +139,10 @@ def _pair_hypothesis(
     length = float(np.linalg.norm(np.diff(problem.predicted_vu[star], axis=0)))
     if abs(theta) > problem.context.max_rotation_rad + options.separation_px / max(length, 1e-6):
         return None
-    offset, theta = similarity(problem, star, source)
+    theta = theta if problem.context.fit_camera_rotation else 0.0
+    centre = problem.context.camera_model.centre_vu
+    arm = problem.predicted_vu[star].mean(axis=0) - centre
+    offset = problem.measured_vu[source].mean(axis=0) - centre - plane_rotation(theta) @ arm
     log_odds = assignment_log_odds(problem, ratio, star, source, offset, theta, options.match)
     return Hypothesis(star, source, offset, theta, log_odds) if np.isfinite(log_odds) else None
 

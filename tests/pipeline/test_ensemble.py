@@ -25,7 +25,9 @@ def _context(turns: bool) -> NavContext:
     return NavContext(camera, np.eye(3), turns, 5.0, (50.0, 50.0))
 
 
-def _two(name: str, offset: FloatArray, covariance: FloatArray, confidence: float = 0.999, source: str = "") -> TechniqueResult:
+def _two(
+    name: str, offset: FloatArray, covariance: FloatArray, confidence: float = 0.999, source: str = ""
+) -> TechniqueResult:
     sources = (source,) if source else ()
     return TechniqueResult(name, offset, 0.0, information_of(covariance), CENTRE, confidence, error_sources=sources)
 
@@ -65,7 +67,10 @@ def test_mixed_degrees_of_freedom_are_a_programmers_error() -> None:
 
 
 def test_two_answers_merge_by_their_precision() -> None:
-    a, b = _two("a", np.array([1.0, 2.0]), np.diag([0.04, 0.04])), _two("b", np.array([1.3, 2.0]), np.diag([0.02, 0.04]))
+    a, b = (
+        _two("a", np.array([1.0, 2.0]), np.diag([0.04, 0.04])),
+        _two("b", np.array([1.3, 2.0]), np.diag([0.02, 0.04])),
+    )
     estimate = _fused([a, b], False)
     assert_allclose(estimate.offset_vu, [(1.0 * 25 + 1.3 * 50) / 75, 2.0], rtol=1e-12)
     assert_allclose(estimate.covariance, np.diag([1 / 75, 1 / 50]), rtol=1e-12)
@@ -91,7 +96,9 @@ def test_three_parameters_merge_at_the_centre_whatever_their_pivots(seed: int, c
     assert_allclose(estimate.offset_vu, OFFSET, atol=1e-6)
     assert estimate.rotation_rad == pytest.approx(THETA, abs=1e-9)
     scale = np.sqrt(np.diag(np.linalg.inv(total)))
-    assert_allclose(estimate.covariance / np.outer(scale, scale), np.linalg.inv(total) / np.outer(scale, scale), atol=1e-6)
+    assert_allclose(
+        estimate.covariance / np.outer(scale, scale), np.linalg.inv(total) / np.outer(scale, scale), atol=1e-6
+    )
 
 
 def test_forgetting_the_pivot_would_be_off_by_pixels() -> None:
@@ -255,7 +262,9 @@ def test_dependent_answers_do_not_count_twice() -> None:
     assert estimate.excluded == (("seed", "dependent"),)
     assert_allclose(estimate.covariance, 0.9 * GOOD, rtol=1e-9)
     other = _two("limb", OFFSET, GOOD, source="limb")
-    assert_allclose(_fused([seed, refined, other], False).covariance, np.linalg.inv(np.linalg.inv(GOOD) * (1 + 1 / 0.9)))
+    assert_allclose(
+        _fused([seed, refined, other], False).covariance, np.linalg.inv(np.linalg.inv(GOOD) * (1 + 1 / 0.9))
+    )
 
 
 def test_more_evidence_beats_a_smaller_stated_sigma() -> None:

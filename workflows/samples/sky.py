@@ -31,7 +31,7 @@ MATCH_RADIUS_RAD = 1500.0 * MAS
 MATCH_MAGNITUDES = 2.5
 """Largest difference |Hp - G| of the same star; the reddest giants and dwarfs come near it."""
 HIDDEN_MOTION_MASYR = 20.0
-"""Sigma per axis of the motion of stars for which no catalogue gives one: that of Hipparcos stars fainter than G = 9."""
+"""Sigma per axis of the motion of stars that have none in any catalogue: that of Hipparcos stars beyond G = 9."""
 HIDDEN_MOTION_SEED = 20
 
 _GAIA_ROW = np.dtype(

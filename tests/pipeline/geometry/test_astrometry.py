@@ -48,7 +48,7 @@ def _pmpx(years: float, parallax_mas: FloatArray, position_au: FloatArray, movin
 def test_constants_are_the_defined_ones() -> None:
     assert ASTRONOMICAL_UNIT_KM * 1e3 == erfa.DAU
     assert SPEED_OF_LIGHT_KM_S * 1e3 == erfa.CMPS
-    assert RAD_PER_MAS == pytest.approx(erfa.DAS2R / 1e3, rel=1e-15)
+    assert_allclose(RAD_PER_MAS, erfa.DAS2R / 1e3, rtol=1e-15)
 
 
 @pytest.mark.parametrize("et", [-1.2e9, 0.0, 4.7e8])

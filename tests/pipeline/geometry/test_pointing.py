@@ -48,7 +48,7 @@ def test_predicted_plus_offset_is_actual_at_the_centre(camera: CameraModel) -> N
     star = PRIOR.T @ unproject(camera, camera.centre_vu[None])[0][0]
     after = corrected_attitude(camera, PRIOR, np.array([12.0, -30.0]), 0.05)
     seen = project(camera, (after @ star)[None])[0][0]
-    assert_allclose(seen, camera.centre_vu + [12.0, -30.0], atol=1e-7)
+    assert_allclose(seen, camera.centre_vu + np.array([12.0, -30.0]), atol=1e-7)
 
 
 @every_camera

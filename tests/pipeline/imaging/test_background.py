@@ -90,7 +90,7 @@ def _stairs(gain: float, read: float, low: float, high: float, seed: int) -> Ima
 
 @pytest.mark.parametrize("gain", [0.5, 2.0, 10.0])
 def test_gain_of_an_image_that_spans_levels(gain: float) -> None:
-    options, estimates = BackgroundOptions(tile_px=32, stride_px=1), []
+    options, estimates = BackgroundOptions(tile_px=32, samples_per_side=32), []
     for seed in range(4):
         background = estimate_background(_stairs(gain, 1.0, 10.0, 600.0, seed), CLEAR, 1.0, None, options)
         estimate = estimate_gain(background, 1.0)

@@ -22,13 +22,19 @@ def _profile(centre: float, size: int, sigma: float) -> FloatArray:
     return np.asarray(np.diff(ndtr((edges - centre) / sigma)))
 
 
-def _render(places: FloatArray, flux: FloatArray, sigma: float, trail: tuple[float, float], size: int = SIZE) -> FloatArray:
+def _render(
+    places: FloatArray, flux: FloatArray, sigma: float, trail: tuple[float, float], size: int = SIZE
+) -> FloatArray:
     """Gaussians integrated over pixels, spread over a fine trail."""
     image = np.zeros((size, size))
     steps = [0.0] if trail == (0.0, 0.0) else (np.arange(60) + 0.5) / 60 - 0.5
     for (v, u), f in zip(places, flux, strict=True):
         for s in steps:
-            image += f / len(steps) * np.outer(_profile(v + s * trail[0], size, sigma), _profile(u + s * trail[1], size, sigma))
+            image += (
+                f
+                / len(steps)
+                * np.outer(_profile(v + s * trail[0], size, sigma), _profile(u + s * trail[1], size, sigma))
+            )
     return image
 
 
@@ -42,7 +48,9 @@ def _stamped(places: FloatArray, flux: float, sigma: float, trail: tuple[float, 
     return image
 
 
-def _fit(image: FloatArray, starts: FloatArray, spread: PointSpread, gain: float | None, full: float = np.inf) -> PointSources:
+def _fit(
+    image: FloatArray, starts: FloatArray, spread: PointSpread, gain: float | None, full: float = np.inf
+) -> PointSources:
     pixels: Image = image.astype(np.float32)
     saturated = pixels >= full
     noise = np.full(pixels.shape, READ, np.float32)
@@ -54,6 +62,7 @@ def _fit(image: FloatArray, starts: FloatArray, spread: PointSpread, gain: float
     [
         (0.6, 500.0, None, (0.0, 0.0)),
         (1.0, 20000.0, 2.0, (0.0, 0.0)),  # shot noise of the star itself rules
+        (1.0, 2000.0, 0.5, (0.0, 0.0)),  # weights taken from the data would pull the flux down by 0.35 sigma here
         (1.5, 2000.0, 5.0, (0.0, 0.0)),
         (0.8, 4000.0, 3.0, (5.0, 3.0)),
     ],
@@ -61,7 +70,7 @@ def _fit(image: FloatArray, starts: FloatArray, spread: PointSpread, gain: float
 def test_fits_are_unbiased_and_their_covariance_is_the_scatter(
     sigma: float, flux: float, gain: float | None, trail: tuple[float, float]
 ) -> None:
-    rng = np.random.default_rng(int(flux))
+    rng = np.random.default_rng(int(flux + 100 * sigma))
     places = GRID + rng.uniform(-0.5, 0.5, GRID.shape)
     image = _stamped(places, flux, sigma, trail)
     if gain is not None:
@@ -78,8 +87,7 @@ def test_fits_are_unbiased_and_their_covariance_is_the_scatter(
     assert distance2.mean() == pytest.approx(2.0, abs=4 * 2 / np.sqrt(len(places)))
     flux_pull = (sources.flux_dn - flux) / sources.flux_sigma_dn
     assert flux_pull.std() == pytest.approx(1.0, abs=RMS_SCATTER)
-    # A sigma that falls with the flux pulls the mean down by a fraction of one sigma.
-    assert abs(flux_pull.mean()) < 0.3
+    assert abs(flux_pull.mean()) < 4 / np.sqrt(len(places))
     assert (sources.chi2 / sources.dof).mean() == pytest.approx(1.0, abs=0.05)
     if trail != (0.0, 0.0):
         # Along (5, 3) the place is known worse than across, so errors along v and u go together.
@@ -138,7 +146,11 @@ def test_a_neighbours_light_is_taken_away(gap: float, ratio: float) -> None:
     assert together.ok.all()
     apart = np.abs(together.position_vu - places).max()
     alone = np.abs(_fit(image, places[1:], PointSpread(1.0), None).position_vu[0] - places[1]).max()
-    print("neighbours", gap, ratio, apart, alone, together.flux_dn / flux)
+    # Two sweeps leave a few hundredths of a pixel of two windows that overlap; a fit that knows of no neighbour is
+    # tens of times worse, or walks over to the brighter star.
+    assert apart < (0.05 if gap == 4.0 else 1e-3)
+    assert alone > 8 * apart
+    assert_allclose(together.flux_dn, flux, rtol=0.05)
 
 
 def test_a_star_at_the_arrays_edge_is_fitted_by_the_half_that_is_there() -> None:
@@ -147,7 +159,9 @@ def test_a_star_at_the_arrays_edge_is_fitted_by_the_half_that_is_there() -> None
     sources = _fit(image, np.rint(places), PointSpread(1.0), None)
     assert sources.ok.all()
     assert_allclose(sources.position_vu, places, atol=0.01)
-    middle = _fit(_render(places[:1] + 30.0, np.array([5000.0]), 1.0, (0.0, 0.0), 90), places[:1] + 30.0, PointSpread(1.0), None)
+    middle = _fit(
+        _render(places[:1] + 30.0, np.array([5000.0]), 1.0, (0.0, 0.0), 90), places[:1] + 30.0, PointSpread(1.0), None
+    )
     assert sources.covariance_vu[0, 0, 0] > 1.2 * middle.covariance_vu[0, 0, 0]  # half of the light is not there
 
 

@@ -1,5 +1,7 @@
 """The techniques' interface: embedding, information and covariance, edges, contracts."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -143,8 +145,8 @@ def test_the_context_is_the_states() -> None:
 
 
 def test_an_inventory_has_one_length() -> None:
-    n, text = 2, np.array(["a", "b"])
-    table = FeatureTable(text, text, *[np.zeros((n, 2))] * 3, *[np.zeros(n)] * 3, np.ones(n, bool), text)
+    text, pair, one = np.array(["a", "b"]), np.zeros((2, 2)), np.zeros(2)
+    table = FeatureTable(text, text, pair, pair, pair, one, one, one, one > 0, text)
     assert len(table) == 2
     with pytest.raises(ContractError):
-        FeatureTable(text, text, *[np.zeros((n, 2))] * 3, *[np.zeros(n + 1)] * 3, np.ones(n, bool), text)
+        replace(table, snr=np.zeros(3))

@@ -1,0 +1,40 @@
+from io import BytesIO
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib.image import imread
+
+from catalogs.images import read_image
+from tests.scenes.runs import run_archive
+from workflows.picture import draw_image
+from workflows.samples.options import StarSampleOptions
+from workflows.samples.stars import make_star_sample
+from workflows.store import read_json
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("picture")
+    options = StarSampleOptions(frames=2, seed=3, cameras=("lorri_4x4",), min_stars=6, max_stars=20, processes=1)
+    archive = make_star_sample(root / "archive", options)
+    run_archive(archive, root / "run")
+    return root
+
+
+def test_navigated_stars_are_boxed_where_they_are(run: Path) -> None:
+    path = sorted((run / "run" / "images").glob("*.json"))[0]
+    document = read_json(path)
+    assert document is not None
+    raw = read_image((run / "archive" / "frames" / f"{path.stem}.fits").read_bytes(), path.stem)
+    picture = imread(BytesIO(draw_image(raw.pixels, document)), format="png")
+    assert picture.shape[1] == 880
+    orange = np.array([0xE6, 0x9F, 0x00]) / 255
+    assert (np.abs(picture[..., :3] - orange).max(axis=2) < 0.02).sum() > 50
+
+
+def test_an_image_without_an_answer_still_has_a_picture(run: Path) -> None:
+    document = read_json(sorted((run / "run" / "images").glob("*.json"))[0])
+    assert document is not None
+    document |= {"offset_px": None, "sigma_px": None, "techniques": [], "status": "failed"}
+    assert draw_image(np.zeros((100, 100), np.float32), document).startswith(b"\x89PNG")
