@@ -61,7 +61,7 @@ class RawImage:
     Attributes
     ----------
     pixels
-        (rows, cols) as stored, native byte order.
+        (rows, cols) as stored, native byte order, floats no longer than 32 bits.
     header
         Cards of the image's header.
     extensions
@@ -120,8 +120,9 @@ def _forgiving(name: str) -> Iterator[None]:
 
 def _read_fits(data: bytes, name: str) -> RawImage:
     hdus = fits.open(BytesIO(data), memmap=False, lazy_load_hdus=True)
-    first = next((hdu for hdu in hdus if hdu.is_image and hdu.header.get("NAXIS", 0) >= 2), None)
-    if first is None:
+    # What stands behind the first pixels (flags, errors) is never the image, even where these are none.
+    first = next((hdu for hdu in hdus if hdu.is_image and hdu.header.get("NAXIS", 0) >= 1), None)
+    if first is None or first.header["NAXIS"] < 2:
         if len(data) % _BLOCK or len(data) <= _BLOCK:
             raise ImageError(StatusReason.IMAGE_TRUNCATED, f"{name} ends inside its header")
         raise ImageError(StatusReason.IMAGE_UNREADABLE, f"{name} holds no two-dimensional image")
@@ -175,6 +176,10 @@ def _data_bytes(header: fits.Header) -> int:
 
 
 def _native(array: Image) -> Image:
+    if array.dtype.kind == "f" and array.dtype.itemsize > 4:
+        # Nothing downstream is finer; what is too large for it becomes infinite, and that is looked for.
+        with np.errstate(over="ignore"):
+            return array.astype(np.float32)
     if array.dtype.byteorder == ">":
         return array.astype(array.dtype.newbyteorder("="))
     return np.ascontiguousarray(array)

@@ -20,7 +20,7 @@ from pipeline.status import StatusReason
 from pipeline.techniques.base import NavContext, TechniqueResult
 
 # Relative size below which an eigenvalue of a scaled information matrix counts as zero.
-_NULL = 1e-10
+_NULL = 1e-13
 
 
 class EnsembleOptions(Options):

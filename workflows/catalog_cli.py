@@ -12,7 +12,7 @@ from catalogs.stars import BUILT_IN_NAMES, added_index, build_index, cache_folde
 from pipeline.errors import ConfigurationError
 from workflows.store import write_atomically
 
-app = typer.Typer(no_args_is_help=True, help="Star catalogues.", rich_markup_mode=None)
+app = typer.Typer(help="Star catalogues.", rich_markup_mode=None)
 
 
 @app.command()

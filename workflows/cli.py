@@ -8,11 +8,11 @@ from collections import Counter
 from pathlib import Path
 from typing import Annotated
 
-import click
 import typer
 import yaml
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from typer.exceptions import TyperException
 
 from catalogs.archive import Archive, open_archive
 from catalogs.images import read_image
@@ -35,7 +35,7 @@ from workflows.store import RunFolder, read_json, refuse_foreign, write_atomical
 from workflows.task import Outcome
 
 app = typer.Typer(
-    name="pilotage", no_args_is_help=True, add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False,
+    name="pilotage", add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False,
     help="Navigate archives of planetary images: pointing offsets, rotations and uncertainties that hold.",
 )  # fmt: skip
 app.add_typer(sample_cli.app, name="sample")
@@ -248,18 +248,18 @@ def main() -> None:
     # A pipe that is closed early (`| head`) ends the program quietly, as for any Unix tool.
     signal.signal(signal.SIGPIPE, signal.SIG_DFL)
     try:
-        code = app(standalone_mode=False)
-    except click.exceptions.NoArgsIsHelpError as error:
-        error.show()
-        code = EXIT_NOT_STARTED
-    except click.ClickException as error:
-        code = _complain(error.format_message())
+        # Who says nothing wants to be told what can be said.
+        code = app(sys.argv[1:] or ["--help"], standalone_mode=False)
+        if code == EXIT_INTERRUPTED:
+            raise KeyboardInterrupt
+    except TyperException as error:
+        code = _complain(f"{error.format_message()} (see pilotage --help)")
     except OSError as error:
         # Full disks and lost mounts: no fault of any one image, so the run has stopped.
         code = _complain(f"{error.filename or 'input or output'}: {error.strerror or error}")
     except PilotageError as error:
         code = _complain(str(error))
-    except (KeyboardInterrupt, click.Abort):
+    except (KeyboardInterrupt, typer.Abort):
         typer.echo("pilotage: interrupted; run the same command again to go on", err=True)
         code = EXIT_INTERRUPTED
     sys.exit(code if isinstance(code, int) else 0)

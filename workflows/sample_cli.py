@@ -9,7 +9,7 @@ from pipeline.errors import ConfigurationError
 from workflows.samples.options import StarSampleOptions
 from workflows.samples.stars import make_star_sample
 
-app = typer.Typer(no_args_is_help=True, help="Make sample archives with planted truth.", rich_markup_mode=None)
+app = typer.Typer(help="Make sample archives with planted truth.", rich_markup_mode=None)
 
 
 @app.callback()
@@ -31,6 +31,6 @@ def stars(
     options = StarSampleOptions(frames=frames, seed=seed, false_fraction=false_fraction, processes=processes)
     try:
         path = make_star_sample(directory, options)
-    except (ValueError, FileExistsError) as error:
-        raise ConfigurationError(str(error)) from error
+    except (ValueError, OSError) as error:
+        raise ConfigurationError(f"{directory}: {error}") from error
     typer.echo(f"{frames} images and truth.json in {path.parent}")

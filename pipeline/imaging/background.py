@@ -15,7 +15,7 @@ _QUANTILES = (0.158655, 0.5, 0.841345)
 # A tile with fewer valid samples says nothing and takes its neighbours' values.
 _MIN_TILE_SAMPLES = 24
 # Tiles' noise figures scatter by a few per cent: within this factor they are one figure.
-_EVEN_NOISE = 1.35
+_EVEN_NOISE = 1.25
 
 
 class BackgroundOptions(Options):

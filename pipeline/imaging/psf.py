@@ -249,7 +249,7 @@ def _add_star(canvas, p, radius, shape):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True, fastmath=_REORDER)
 def _fit_all(image, bad, saturated, sigma_map, starts, radius, shape, inv_gain, params, covs, stats, ok):  # type: ignore[no-untyped-def]
-    """Fit every star, then again those with a neighbour in reach, the neighbours' models taken away."""
+    """Fit every star, the brighter ones taken away before, then again those with a neighbour in reach."""
     rows, cols = image.shape
     n = len(starts)
     side = 2 * radius + 1
@@ -276,17 +276,15 @@ def _fit_all(image, bad, saturated, sigma_map, starts, radius, shape, inv_gain, 
             if nv < 3 or nu < 3:
                 ok[s] = False
                 continue
-            others[:] = 0.0
-            if sweep == 1:
-                own[:] = 0.0
-                if ok[s]:
-                    shifted = params[s].copy()
-                    shifted[1] -= v0
-                    shifted[2] -= u0
-                    _add_star(own, shifted, radius, shape)
-                for i in range(nv):
-                    for j in range(nu):
-                        others[i, j] = canvas[v0 + i, u0 + j] - own[i, j]
+            own[:] = 0.0
+            if sweep == 1 and ok[s]:
+                shifted = params[s].copy()
+                shifted[1] -= v0
+                shifted[2] -= u0
+                _add_star(own, shifted, radius, shape)
+            for i in range(nv):
+                for j in range(nu):
+                    others[i, j] = canvas[v0 + i, u0 + j] - own[i, j]
             chi2, count, good = _fit_one(
                 image, others, bad, sigma_map, begin, v0, u0, nv, nu, shape, inv_gain, params[s], covs[s]
             )
@@ -296,10 +294,8 @@ def _fit_all(image, bad, saturated, sigma_map, starts, radius, shape, inv_gain, 
                     full += saturated[v0 + i, u0 + j]
             stats[s, 0], stats[s, 1], stats[s, 2] = chi2, count - 4, full
             ok[s] = good
-        if sweep == 0:
-            for s in range(n):
-                if ok[s]:
-                    _add_star(canvas, params[s], radius, shape)
+            if sweep == 0 and good:
+                _add_star(canvas, params[s], radius, shape)
 
 
 def fit_point_sources(
@@ -332,7 +328,7 @@ def fit_point_sources(
     spread
         Shape of a point source.
     starts_vu
-        (n, 2) first guesses.
+        (n, 2) first guesses, brightest first: a star is fitted after the brighter ones are taken away.
     reach_px
         A fit that moves farther than this from its start has failed; by default the window's half-width.
 

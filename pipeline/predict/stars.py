@@ -6,11 +6,14 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from pipeline.camera import pixel_scale_rad, project
+from pipeline.camera import field_of_view, pixel_scale_rad, project
 from pipeline.frame import Frame
 from pipeline.geometry.astrometry import RAD_PER_MAS, apparent_directions, julian_year
 from pipeline.options import Options
 from pipeline.records import BoolArray, CameraModel, FloatArray, Record, StarTable, State
+
+# Rounding at the corners of the field must not cost a star.
+_FIELD_SLACK_RAD = 1e-6
 
 
 class StarPredictionOptions(Options):
@@ -101,6 +104,9 @@ def predict_stars(stars: StarTable, state: State, frame: Frame, options: StarPre
     flux = expected_flux(stars.mag, state)
     snr = flux / flux_sigma(flux, frame)
     keep = ahead & near_array(position, state.camera_model, reach_px(state)) & ~(snr < options.min_snr)
+    # Far outside its field a distortion may fold back onto the array what no camera sees.
+    axis, half_angle = field_of_view(state.camera_model, reach_px(state))
+    keep &= directions @ (state.attitude.camera_from_j2000.T @ axis) >= np.cos(half_angle + _FIELD_SLACK_RAD)
     order = np.flatnonzero(keep)
     order = order[np.lexsort((stars.star_id[order], stars.mag[order]))][: options.max_stars]
     scale = np.sqrt(np.prod(pixel_scale_rad(state.camera_model)))

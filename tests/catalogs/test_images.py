@@ -32,7 +32,7 @@ def reason_of(data: bytes) -> StatusReason:
 def test_pixel_types_come_back_in_native_order(dtype: str) -> None:
     pixels = (PIXELS % 251).astype(dtype)
     raw = read_image(written(fits.PrimaryHDU(pixels)), "x.fits")
-    assert raw.pixels.dtype == np.dtype(dtype)
+    assert raw.pixels.dtype == np.dtype("f4" if dtype == "f8" else dtype)
     assert raw.pixels.dtype.isnative
     assert np.array_equal(raw.pixels, pixels)
 

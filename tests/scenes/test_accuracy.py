@@ -1,5 +1,6 @@
 """Sigmas are promises: pulls over hundreds of frames of the sample archive, per technique and fused."""
 
+import json
 from pathlib import Path
 
 import duckdb
@@ -47,7 +48,8 @@ def test_fused_answers(sample: tuple[Path, Path, pd.DataFrame]) -> None:
 @pytest.mark.parametrize("technique", ["StarFieldFromCatalogNav", "StarUniqueMatchNav", "StarRefineNav"])
 def test_each_technique(technique: str, sample: tuple[Path, Path, pd.DataFrame]) -> None:
     archive, run, _ = sample
-    truth = pd.DataFrame.from_dict(read_truth(archive.parent / "truth.json"), orient="index")
+    frames = json.loads((archive.parent / "truth.json").read_text())["frames"]
+    truth = pd.DataFrame.from_dict(frames, orient="index")
     query = f"select * from read_parquet('{run}/techniques/**/*.parquet', hive_partitioning = true)"
     with duckdb.connect() as database:
         table = database.sql(query).df()

@@ -135,4 +135,4 @@ def test_values_of_settings_are_yaml() -> None:
     assert parse_setting("a.b=[1, x]") == {"a": {"b": [1, "x"]}}
     assert parse_setting("a=") == {"a": None}
     assert parse_setting("a=b=c") == {"a": "b=c"}
-    assert PER_IMAGE == parse_setting(f"stars={PER_IMAGE}")["stars"]
+    assert parse_setting(f"stars={PER_IMAGE}")["stars"] == PER_IMAGE
