@@ -22,13 +22,14 @@ LEVELS = (
     ("ensemble",),
     ("navigate",),
     ("curate",),
+    ("tables",),
 )
 # Within a folder: modules that the others of it may import, lowest first. All others are equals.
 FOUNDATIONS = {
     "geometry": ("rotations",),
     "imaging": ("psf",),
     "predict": (),
-    "techniques": ("base", "star_fit", "star_match", "star_inventory"),
+    "techniques": ("base", "star_fit", "star_match", "star_search", "star_inventory"),
 }
 OUTSIDE_OF_SCIENCE = {
     "catalogs", "workflows", "dask", "distributed", "spiceypy", "astropy", "erfa", "fsspec", "duckdb", "pandas", "yaml",

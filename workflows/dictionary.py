@@ -5,8 +5,8 @@
 
 from pathlib import Path
 
-from pipeline.curate import SCHEMAS
 from pipeline.status import StatusReason, status_of
+from pipeline.tables import SCHEMAS
 
 TARGET = Path("outputs/README.md")
 

@@ -14,8 +14,9 @@ from uuid import uuid4
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from pipeline.curate import SCHEMAS, Json, feature_columns, offset_row, technique_rows
+from pipeline.curate import Json
 from pipeline.errors import ConfigurationError
+from pipeline.tables import SCHEMAS, feature_columns, offset_row, technique_rows
 
 # Images whose rows are written together: bounds memory and fixes the row groups whatever the worker count.
 _IMAGES_PER_GROUP = 2000

@@ -19,8 +19,8 @@ from pipeline.techniques.star_match import (
     posterior,
     refine,
     same_answer,
-    search,
 )
+from pipeline.techniques.star_search import search
 
 NAME = "StarFieldFromCatalogNav"
 

@@ -10,16 +10,12 @@ import pytest
 from numpy.testing import assert_allclose
 
 from pipeline.curate import (
-    SCHEMAS,
     Json,
     Provenance,
     RankOptions,
     build_metadata_dict,
     error_document,
-    feature_columns,
-    offset_row,
     rank_of,
-    technique_rows,
 )
 from pipeline.ensemble import EnsembleOptions, ensemble
 from pipeline.geometry.pointing import offset_between
@@ -28,6 +24,7 @@ from pipeline.navigate import Navigation
 from pipeline.options import InstrumentSettings
 from pipeline.records import Attitude, CameraModel, Detector, FloatArray, Spacecraft, State
 from pipeline.status import Rank, Status, StatusReason
+from pipeline.tables import SCHEMAS, feature_columns, offset_row, technique_rows
 from pipeline.techniques.base import FeatureTable, NavContext, TechniqueFailure, TechniqueResult
 
 CAMERA = CameraModel((400, 400), 500.0, np.diag([50.0, -50.0]), np.array([199.5, 199.5]))

@@ -16,9 +16,9 @@ from catalogs.archive import open_archive
 from pipeline.errors import ConfigurationError
 from tests.support import answers, describe, pilotage, reasons, run_serial, some_frames, temporary_files, write_sidecar
 from workflows.config import load_configuration
+from workflows.execute import ClusterOptions
 from workflows.plan import Plan, make_plan
 from workflows.run import RunListener, execute
-from workflows.execute import ClusterOptions
 from workflows.store import RunFolder
 
 FRAMES = 5

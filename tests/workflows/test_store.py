@@ -6,9 +6,10 @@ from pathlib import Path
 import pyarrow.parquet as pq
 import pytest
 
-from pipeline.curate import SCHEMAS, Json, Provenance, error_document
+from pipeline.curate import Json, Provenance, error_document
 from pipeline.errors import ConfigurationError
 from pipeline.status import StatusReason
+from pipeline.tables import SCHEMAS
 from workflows.store import (
     RunFolder,
     exclusive,

@@ -1,0 +1,216 @@
+"""Tables of a run: their schemas, and rows made from the images' documents."""
+
+from collections.abc import Iterable, Mapping
+
+import pyarrow as pa
+
+from pipeline.curate import Json
+
+Row = dict[str, Json]
+
+
+def _field(name: str, kind: pa.DataType, unit: str, meaning: str) -> pa.Field:
+    return pa.field(name, kind, metadata={"unit": unit, "meaning": meaning})
+
+
+_TEXT, _REAL, _FLAG = pa.string(), pa.float64(), pa.bool_()
+_IDENTITY = (
+    _field("image_id", _TEXT, "", "image"),
+    _field("mission", _TEXT, "", "mission (partition)"),
+    _field("camera", _TEXT, "", "camera (partition)"),
+)
+_PIXEL = "px"
+
+SCHEMAS: dict[str, pa.Schema] = {
+    "offsets": pa.schema([
+        *_IDENTITY,
+        _field("time_utc", _TEXT, "ISO-8601 UTC", "mid-exposure"),
+        _field("status", _TEXT, "", "success, failed, conflicted or error"),
+        _field("status_reason", _TEXT, "", "the one cause behind the status"),
+        _field("rank", _TEXT, "", "high, medium, low, failed or conflicted"),
+        _field("confidence", _REAL, "probability", "that the answer is no mistake; null without an answer"),
+        _field("offset_dv_px", _REAL, _PIXEL, "predicted + offset = actual, along rows, at the array centre"),
+        _field("offset_du_px", _REAL, _PIXEL, "the same along columns"),
+        _field("sigma_dv_px", _REAL, _PIXEL, "1 sigma of offset_dv_px"),
+        _field("sigma_du_px", _REAL, _PIXEL, "1 sigma of offset_du_px"),
+        _field("cov_dv_du_px2", _REAL, "px2", "covariance of the two"),
+        _field("rotation_deg", _REAL, "deg", "in-plane rotation, +u toward +v; null if not fitted or not observable"),
+        _field("sigma_rotation_deg", _REAL, "deg", "1 sigma of rotation_deg"),
+        _field("observable_dv", _REAL, "", "v of the unit vector of the one observable direction, else null"),
+        _field("observable_du", _REAL, "", "u of it"),
+        _field("offset_along_px", _REAL, _PIXEL, "offset along the observable direction"),
+        _field("sigma_along_px", _REAL, _PIXEL, "1 sigma of it"),
+        _field("qw", _REAL, "", "corrected camera_from_j2000 quaternion, scalar part; null without a full answer"),
+        _field("qx", _REAL, "", "its x"),
+        _field("qy", _REAL, "", "its y"),
+        _field("qz", _REAL, "", "its z"),
+        _field("techniques", _TEXT, "", "techniques fused, separated by '+'"),
+        _field("features_used", pa.int64(), "count", "features that the most informative technique used"),
+        _field("image_class", _TEXT, "", "normal, noisy or gradient; null where the image was refused"),
+        _field("detail", _TEXT, "", "one line for a person"),
+        _field("config_digest", _TEXT, "", "sha256 of the configuration"),
+    ]),
+    "techniques": pa.schema([
+        *_IDENTITY,
+        _field("technique", _TEXT, "", "name"),
+        _field("status_reason", _TEXT, "", "navigated, or why not"),
+        _field("offset_dv_px", _REAL, _PIXEL, "offset about the technique's own pivot"),
+        _field("offset_du_px", _REAL, _PIXEL, "the same along columns"),
+        _field("sigma_dv_px", _REAL, _PIXEL, "1 sigma"),
+        _field("sigma_du_px", _REAL, _PIXEL, "1 sigma"),
+        _field("cov_dv_du_px2", _REAL, "px2", "covariance of the two"),
+        _field("rotation_deg", _REAL, "deg", "null if not fitted or not observable"),
+        _field("sigma_rotation_deg", _REAL, "deg", "1 sigma"),
+        _field("pivot_v_px", _REAL, _PIXEL, "pivot of the rotation"),
+        _field("pivot_u_px", _REAL, _PIXEL, "pivot of the rotation"),
+        _field("confidence", _REAL, "probability", "the technique's own"),
+        _field("at_edge", _FLAG, "", "the search ran into its bound"),
+        _field("in_ensemble", _FLAG, "", "fused into the image's answer"),
+        _field("left_out", _TEXT, "", "why it was not fused"),
+        _field("features_used", pa.int64(), "count", "features in the fit"),
+        _field("extra_sigma_px", _REAL, _PIXEL, "scatter of the residuals beyond the stated sigmas"),
+        _field("detail", _TEXT, "", "one line for a person"),
+    ]),
+    "features": pa.schema([
+        *_IDENTITY,
+        _field("technique", _TEXT, "", "technique that looked for it"),
+        _field("name", _TEXT, "", "catalogue name"),
+        _field("kind", _TEXT, "", "star"),
+        _field("predicted_v_px", _REAL, _PIXEL, "under the a-priori attitude"),
+        _field("predicted_u_px", _REAL, _PIXEL, "under the a-priori attitude"),
+        _field("measured_v_px", _REAL, _PIXEL, "null where not found"),
+        _field("measured_u_px", _REAL, _PIXEL, "null where not found"),
+        _field("residual_v_px", _REAL, _PIXEL, "measured minus predicted under the fitted pointing"),
+        _field("residual_u_px", _REAL, _PIXEL, "measured minus predicted under the fitted pointing"),
+        _field("sigma_px", _REAL, _PIXEL, "1 sigma of the measurement per axis"),
+        _field("mag", _REAL, "mag", "catalogue magnitude"),
+        _field("snr", _REAL, "", "expected signal to noise"),
+        _field("used", _FLAG, "", "took part in the fit"),
+        _field("reason", _TEXT, "", "why not; empty where used"),
+    ]),
+    "timings": pa.schema([
+        *_IDENTITY,
+        _field("stage", _TEXT, "", "stage of the pipeline, or total"),
+        _field("seconds", _REAL, "s", "wall-clock time on its worker"),
+    ]),
+}  # fmt: skip
+
+
+def _pair(value: Json) -> tuple[Json, Json]:
+    return (value[0], value[1]) if isinstance(value, list) else (None, None)
+
+
+def _identity(document: Mapping[str, Json]) -> Row:
+    return {key: document[key] for key in ("image_id", "mission", "camera")}
+
+
+def _used(technique: Mapping[str, Json]) -> int | None:
+    features = technique.get("features")
+    return (
+        sum(map(bool, features["used"])) if isinstance(features, dict) and isinstance(features["used"], list) else None
+    )
+
+
+def offset_row(document: Mapping[str, Json]) -> Row:
+    """Row of table ``offsets``.
+
+    Parameters
+    ----------
+    document
+        An image's JSON document.
+
+    Returns
+    -------
+    dict
+        One value per column.
+    """
+    techniques = [t for t in document["techniques"] or [] if isinstance(t, dict)]  # type: ignore[union-attr]
+    fused = [t for t in techniques if t.get("in_ensemble")]
+    row: Row = _identity(document)
+    for key in ("time_utc", "status", "status_reason", "rank", "confidence", "detail"):
+        row[key] = document[key]
+    row["offset_dv_px"], row["offset_du_px"] = _pair(document["offset_px"])
+    row["sigma_dv_px"], row["sigma_du_px"] = _pair(document["sigma_px"])
+    covariance = document["covariance_px2"]
+    row["cov_dv_du_px2"] = (
+        covariance[0][1] if isinstance(covariance, list) and isinstance(covariance[0], list) else None
+    )
+    row["rotation_deg"], row["sigma_rotation_deg"] = document.get("rotation_deg"), document.get("sigma_rotation_deg")
+    observable = document["observable"]
+    if isinstance(observable, dict):
+        row["observable_dv"], row["observable_du"] = _pair(observable["direction_vu"])
+        row["offset_along_px"], row["sigma_along_px"] = observable["offset_along_px"], observable["sigma_along_px"]
+    pointing = document["pointing"]
+    quaternion = pointing["camera_from_j2000_wxyz"] if isinstance(pointing, dict) else None
+    if isinstance(quaternion, list):
+        row["qw"], row["qx"], row["qy"], row["qz"] = quaternion
+    row["techniques"] = "+".join(str(t["technique"]) for t in fused)
+    row["features_used"] = max((_used(t) or 0 for t in fused), default=None)
+    frame, provenance = document["frame"], document["provenance"]
+    row["image_class"] = frame["image_class"] if isinstance(frame, dict) else None
+    row["config_digest"] = provenance["config_digest"] if isinstance(provenance, dict) else None
+    return row
+
+
+def technique_rows(document: Mapping[str, Json]) -> list[Row]:
+    """Rows of table ``techniques``.
+
+    Parameters
+    ----------
+    document
+        An image's JSON document.
+
+    Returns
+    -------
+    list of dict
+        One per technique that ran.
+    """
+    rows: list[Row] = []
+    for technique in document["techniques"] or []:  # type: ignore[union-attr]
+        if not isinstance(technique, dict):
+            continue
+        row = _identity(document)
+        for key in (
+            "technique", "status_reason", "detail", "rotation_deg", "sigma_rotation_deg", "confidence", "at_edge",
+            "in_ensemble", "left_out",
+        ):  # fmt: skip
+            row[key] = technique.get(key)
+        row["offset_dv_px"], row["offset_du_px"] = _pair(technique.get("offset_px"))
+        row["sigma_dv_px"], row["sigma_du_px"] = _pair(technique.get("sigma_px"))
+        row["pivot_v_px"], row["pivot_u_px"] = _pair(technique.get("pivot_vu"))
+        covariance, diagnostics = technique.get("covariance_px2"), technique.get("diagnostics")
+        row["cov_dv_du_px2"] = (
+            covariance[0][1] if isinstance(covariance, list) and isinstance(covariance[0], list) else None
+        )
+        row["features_used"] = _used(technique)
+        row["extra_sigma_px"] = diagnostics.get("extra_sigma_px") if isinstance(diagnostics, dict) else None
+        rows.append(row)
+    return rows
+
+
+def feature_columns(documents: Iterable[Mapping[str, Json]]) -> dict[str, list[Json]]:
+    """Columns of table ``features`` for many images.
+
+    Parameters
+    ----------
+    documents
+        Images' JSON documents.
+
+    Returns
+    -------
+    dict
+        One list per column, all of one length.
+    """
+    columns: dict[str, list[Json]] = {name: [] for name in SCHEMAS["features"].names}
+    for document in documents:
+        for technique in document["techniques"] or []:  # type: ignore[union-attr]
+            features = technique.get("features") if isinstance(technique, dict) else None
+            if not isinstance(technique, dict) or not isinstance(features, dict):
+                continue
+            count = len(features["name"])  # type: ignore[arg-type]
+            for name, values in columns.items():
+                if name in features:
+                    values.extend(features[name])  # type: ignore[arg-type]
+                else:
+                    values.extend([technique["technique"] if name == "technique" else document[name]] * count)
+    return columns
