@@ -124,7 +124,11 @@ def read_bytes(url: str, path: str) -> bytes:
         with open(posixpath.join(url, path), "rb") as file:
             return file.read()
     fs, full = _locate(url, path)
-    return bytes(fs.cat_file(full))
+    try:
+        return bytes(fs.cat_file(full))
+    except KeyError as error:
+        # What a zip file says of a name that it does not hold.
+        raise FileNotFoundError(path) from error
 
 
 def file_stamp(url: str, path: str) -> tuple[int, str] | None:

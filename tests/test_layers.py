@@ -114,7 +114,9 @@ def test_catalogs_know_no_workflow(name: str, imported: set[str]) -> None:
     own = name.split(".")[-1]
     for module in imported:
         if module.startswith("catalogs.") and own in ORDER_OF_CATALOGS:
-            assert ORDER_OF_CATALOGS.index(module.split(".")[1]) < ORDER_OF_CATALOGS.index(own), f"{name} imports {module}"
+            assert ORDER_OF_CATALOGS.index(module.split(".")[1]) < ORDER_OF_CATALOGS.index(own), (
+                f"{name} imports {module}"
+            )
 
 
 @pytest.mark.parametrize(("name", "imported"), _of("workflows"))
@@ -145,7 +147,9 @@ def test_nothing_imports_in_a_circle() -> None:
 
 def test_the_checks_can_fail(tmp_path: Path) -> None:
     source = tmp_path / "bad.py"
-    source.write_text("import dask.array\nfrom pipeline import navigate\ndef f():\n    from workflows.plan import Plan\n")
+    source.write_text(
+        "import dask.array\nfrom pipeline import navigate\ndef f():\n    from workflows.plan import Plan\n"
+    )
     assert imports(source) == {"dask.array", "pipeline.navigate", "workflows.plan"}
     assert _cycle({"a": {"b"}, "b": {"c"}, "c": {"a"}, "d": {"a"}}) == ["a", "b", "c", "d"]
     assert _level("pipeline.navigate") > _level("pipeline.techniques.base") > _level("pipeline.records")

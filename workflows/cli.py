@@ -16,6 +16,7 @@ from typer.exceptions import TyperException
 
 from catalogs.archive import Archive, open_archive
 from catalogs.images import read_image
+from pipeline.curate import Json
 from pipeline.errors import ConfigurationError, PilotageError
 from workflows import catalog_cli, sample_cli
 from workflows.config import Configuration, load_configuration, parse_setting
@@ -44,7 +45,6 @@ app.add_typer(catalog_cli.app, name="catalog")
 _ARCHIVE_KEY = "archive."
 _LOG_EVERY_S = 5.0
 _LOG_WIDTH = 130
-_PIPE_WIDTH = 400
 
 ArchiveArg = Annotated[str, typer.Argument(help="Folder or URL with an archive.yaml, or the path of one.")]
 RunArg = Annotated[Path, typer.Argument(help="Folder of a run.")]
@@ -146,7 +146,10 @@ def _follow(console: Console, work: Plan):  # type: ignore[no-untyped-def]
         return f"{rate:.1f} images/s  {parts}"
 
     answered = len(work.every) - total
-    console.print(f"{len(work.every)} images, {answered} answered before, {total} to do", highlight=False)
+
+    def start() -> None:
+        console.print(f"{len(work.every)} images, {answered} answered before, {total} to do", highlight=False)
+
     if console.is_terminal:
         columns = (
             TextColumn("navigating"),
@@ -162,7 +165,7 @@ def _follow(console: Console, work: Plan):  # type: ignore[no-untyped-def]
                 counts[outcome.status] += 1
                 progress.update(task, advance=1, description=line())
 
-            yield RunListener(lambda text: progress.console.print(text, highlight=False), on_done)
+            yield RunListener(lambda text: progress.console.print(text, highlight=False), on_done, start)
         return
     last = time.monotonic()
 
@@ -175,7 +178,7 @@ def _follow(console: Console, work: Plan):  # type: ignore[no-untyped-def]
             left = (total - done) * (last - started) / done
             console.print(f"{done}/{total}  {line()}  {left:.0f} s left", highlight=False, soft_wrap=True)
 
-    yield RunListener(lambda text: console.print(text, highlight=False, soft_wrap=True), log_done)
+    yield RunListener(lambda text: console.print(text, highlight=False, soft_wrap=True), log_done, start)
 
 
 @app.command()
@@ -196,14 +199,8 @@ def show(
 ) -> None:
     """Show outcome counts, one image, or a run against planted truth."""
     folder, console = RunFolder(run_folder), _console()
-    if not console.is_terminal:
-        # A pipe has no width; what reads it should get whole rows.
-        console.width = _PIPE_WIDTH
     if image is not None:
-        document = read_json(folder.document(image))
-        if document is None:
-            raise ConfigurationError(f"{run_folder} has no image {image}")
-        print_image(console, document)
+        print_image(console, _document(run_folder, image))
         return
     table = offsets(folder)
     print_counts(console, table)
@@ -217,6 +214,14 @@ def _console() -> Console:
     return console if console.is_terminal else Console(width=_LOG_WIDTH)
 
 
+def _document(run_folder: Path, image: str) -> dict[str, Json]:
+    document = read_json(RunFolder(run_folder).document(image))
+    # The name of any other file beside the documents is no image either.
+    if document is None or document.get("image_id") != image:
+        raise ConfigurationError(f"{run_folder} has no image {image}")
+    return document
+
+
 @app.command()
 def picture(
     run_folder: RunArg,
@@ -228,10 +233,8 @@ def picture(
     # Drawing libraries take half a second to load, which no other command should pay.
     from workflows.picture import draw_image
 
-    document = read_json(RunFolder(run_folder).document(image))
-    if document is None or not isinstance(document["provenance"], dict):
-        raise ConfigurationError(f"{run_folder} has no image {image}")
-    path = str(document["provenance"]["image_path"])
+    document = _document(run_folder, image)
+    path = str(document["provenance"]["image_path"])  # type: ignore[call-overload, index]
     raw = read_image(open_archive(archive, {}).read(path), path)
     write_atomically(output, draw_image(raw.pixels, document))
     typer.echo(f"{output}")

@@ -4,7 +4,7 @@ import hashlib
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from importlib.metadata import version
 from importlib.resources import files
 from pathlib import Path
@@ -74,11 +74,14 @@ class Setup:
 
     def task_id(self, image_id: str, digests: Mapping[str, str | None]) -> str:
         """Deterministic id of one image's work: identity, options, code, and digests of everything read."""
+        parts: list[object] = [image_id, self._shared_digest, sorted(digests.items())]
+        return hashlib.sha256(json.dumps(parts).encode()).hexdigest()
+
+    @cached_property
+    def _shared_digest(self) -> str:
+        """Digest of what all images have in common: computed once, for it costs as much as a fast stage."""
         description = self.archive.description.model_dump(mode="json", exclude={"name", "images"})
-        parts: list[object] = [
-            image_id, self.configuration.digest(), self.software, description, list(self.star_digests),
-            sorted(digests.items()),
-        ]  # fmt: skip
+        parts: list[object] = [self.configuration.digest(), self.software, description, list(self.star_digests)]
         return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
 
 
@@ -175,27 +178,30 @@ def open_star_tables(archive: Archive) -> tuple[list[StarIndex], bool]:
 def _star_index(archive: Archive, entry: str | StarTableRef) -> StarIndex:
     folder = cache_folder()
     try:
-        if isinstance(entry, str):
-            if entry in BUILT_IN_NAMES:
-                return built_in_index(entry, folder)
-            added = added_index(entry, folder)
-            if added is None:
-                known = ", ".join((*BUILT_IN_NAMES, PER_IMAGE))
-                raise ConfigurationError(
-                    f"{archive.url}: stars: {entry} is neither {known} nor added by `pilotage catalog add`"
-                )
-            return open_index(added)
-        data = archive.read(entry.path)
-        apparent = entry.place == "apparent"
-        digest = hashlib.sha256(data + entry.place.encode()).hexdigest()
-        return build_index(read_table(data, entry.path, apparent), entry.path, digest, folder)
-    except FileNotFoundError as error:
-        name = entry if isinstance(entry, str) else entry.path
-        raise ConfigurationError(f"{archive.url}: stars: {name} is not there") from error
+        if not isinstance(entry, str):
+            return _table_index(archive, entry, folder)
+        if entry in BUILT_IN_NAMES:
+            return built_in_index(entry, folder)
+        added = added_index(entry, folder)
+        if added is None or not added.exists():
+            known = ", ".join((*BUILT_IN_NAMES, PER_IMAGE))
+            raise ConfigurationError(
+                f"{archive.url}: stars: {entry} is neither {known} nor added by `pilotage catalog add`"
+            )
+        return open_index(added)
     except TableProblem as error:
         raise ConfigurationError(f"{archive.url}: stars: {error}") from error
     except OSError as error:
-        raise ConfigurationError(f"{archive.url}: stars: {error}") from error
+        raise ConfigurationError(f"cannot use the star cache {folder}: {error.strerror}") from error
+
+
+def _table_index(archive: Archive, entry: StarTableRef, folder: Path) -> StarIndex:
+    try:
+        data = archive.read(entry.path)
+    except (OSError, ValueError, ImportError) as error:
+        raise ConfigurationError(f"{archive.url}: stars: {entry.path} cannot be read: {error}") from error
+    digest = hashlib.sha256(data + entry.place.encode()).hexdigest()
+    return build_index(read_table(data, entry.path, entry.place == "apparent"), entry.path, digest, folder)
 
 
 def _is_done(ref: ImageRef, setup: Setup, verify: bool) -> bool:

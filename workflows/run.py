@@ -27,10 +27,21 @@ _LIBRARIES = ("numpy", "scipy", "numba", "opencv-python-headless", "astropy", "d
 
 @dataclass(frozen=True)
 class RunListener:
-    """Callbacks by which a terminal follows a run."""
+    """Callbacks by which a terminal follows a run.
+
+    Attributes
+    ----------
+    on_ready
+        Called with a description of the workers.
+    on_done
+        Called with every finished image.
+    on_start
+        Called when nothing can refuse the run any more.
+    """
 
     on_ready: Callable[[str], None]
     on_done: Callable[[Outcome], None]
+    on_start: Callable[[], None] = lambda: None
 
 
 def execute(plan: Plan, options: ClusterOptions, listener: RunListener) -> Counter[str]:
@@ -54,6 +65,7 @@ def execute(plan: Plan, options: ClusterOptions, listener: RunListener) -> Count
     started = datetime.now(UTC)
     ids = ids_of(plan.every)
     with open_workers(plan, options) as run_images, exclusive(folder):
+        listener.on_start()
         digest = hashlib.sha256(json.dumps(ids).encode() + plan.setup.configuration.digest().encode()).hexdigest()
         (folder.root / "run.json").unlink(missing_ok=True)
         write_atomically(folder.plan, to_json({"images": list(ids), "digest": digest}))

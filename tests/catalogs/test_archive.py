@@ -69,7 +69,14 @@ def urls(folder: Path) -> Iterator[list[str]]:
         for name in FILES:
             archive.write(folder / name, name)
             memory.pipe(f"/held/{name}", name.encode())
-    yield [str(folder), f"{folder}/", f"file://{folder}", "memory://held", f"zip://::{packed}", f"zip://::file://{packed}"]
+    yield [
+        str(folder),
+        f"{folder}/",
+        f"file://{folder}",
+        "memory://held",
+        f"zip://::{packed}",
+        f"zip://::file://{packed}",
+    ]
     memory.rm("/held", recursive=True)
 
 
@@ -87,7 +94,7 @@ def test_bytes_and_stamps_by_url(urls: list[str]) -> None:
         assert stamp[0] == len(b"frames/deep/b.fits")
         assert file_stamp(url, "frames/none.fits") is None
         assert file_stamp(url, "top.fits/none.fits") is None
-        with pytest.raises((FileNotFoundError, KeyError)):
+        with pytest.raises(FileNotFoundError):
             read_bytes(url, "frames/none.fits")
 
 
@@ -159,7 +166,9 @@ def test_no_match_is_refused(folder: Path, images: object) -> None:
     assert "no file matches" in refusal(folder, {"images": images})
 
 
-@pytest.mark.parametrize("images", ["/etc/passwd", "../x.fits", "..", ".", "frames/../../x.fits", "http://a/b.fits", "a\0b"])
+@pytest.mark.parametrize(
+    "images", ["/etc/passwd", "../x.fits", "..", ".", "frames/../../x.fits", "http://a/b.fits", "a\0b"]
+)
 def test_paths_outside_the_archive_are_refused(folder: Path, images: str) -> None:
     assert "no path inside the archive" in refusal(folder, {"images": [images]})
 

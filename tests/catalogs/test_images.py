@@ -43,7 +43,9 @@ def test_scaled_pixels_are_real_values() -> None:
     assert np.array_equal(read_image(written(hdu), "x.fits").pixels, (PIXELS % 100) * 0.5 - 7.0)
 
 
-@pytest.mark.parametrize(("shape", "seen"), [((1, 64, 80), (64, 80)), ((3, 64, 80), (3, 64, 80)), ((1, 1, 64, 80), (64, 80))])
+@pytest.mark.parametrize(
+    ("shape", "seen"), [((1, 64, 80), (64, 80)), ((3, 64, 80), (3, 64, 80)), ((1, 1, 64, 80), (64, 80))]
+)
 def test_axes_of_length_one_are_dropped(shape: tuple[int, ...], seen: tuple[int, ...]) -> None:
     assert read_image(written(fits.PrimaryHDU(np.zeros(shape))), "x.fits").pixels.shape == seen
 
@@ -92,7 +94,7 @@ def _with_card(data: bytes, key: str, value: str) -> bytes:
     ("key", "value"),
     [
         ("BITPIX", "17"), ("BITPIX", "'x'"), ("NAXIS", "2.5"), ("NAXIS", "1000"), ("NAXIS1", "-5"), ("NAXIS1", "'x'"),
-        ("NAXIS1", "0"), ("NAXIS1", "99999999999"), ("NAXIS1", "9999999999999999999"), ("NAXIS2", "T"), ("NAXIS2", "@#!"),
+        ("NAXIS1", "0"), ("NAXIS1", "99999999999"), ("NAXIS1", "9" * 19), ("NAXIS2", "T"), ("NAXIS2", "@#!"),
     ],
 )  # fmt: skip
 def test_headers_that_lie_are_refused(key: str, value: str) -> None:
@@ -133,9 +135,7 @@ def test_cards_that_cannot_be_parsed_count_as_missing() -> None:
 def test_random_damage_never_raises_anything_else() -> None:
     rng = np.random.default_rng(3)
     quality = fits.CompImageHDU((PIXELS % 7).astype("i2"), name="quality")
-    whole: NDArray[np.uint8] = np.frombuffer(
-        written(fits.PrimaryHDU(PIXELS.astype("i2")), quality), np.uint8
-    )
+    whole: NDArray[np.uint8] = np.frombuffer(written(fits.PrimaryHDU(PIXELS.astype("i2")), quality), np.uint8)
     for _ in range(150):
         spoiled = whole.copy()
         # Mostly headers: damaged pixels are pixels.

@@ -56,7 +56,7 @@ SPOILED = [
     (as_parquet(GOOD.assign(mag=[np.nan, 1.0])), "s.parquet", "row 1 has no finite mag"),
     (as_parquet(GOOD.assign(dec_deg=[0.0, np.inf])), "s.parquet", "row 2 has no finite dec_deg"),
     (as_parquet(GOOD.assign(ra_deg=pd.array([1, None], dtype="Int64"))), "s.parquet", "ra_deg"),
-    (as_parquet(GOOD.assign(ra_deg=[[1.0], [2.0]])), "s.parquet", "ra_deg is not numeric"),
+    (as_parquet(GOOD.assign(ra_deg=pd.Series([[1.0], [2.0]], dtype=object))), "s.parquet", "ra_deg is not numeric"),
     (as_csv(GOOD.assign(ra_deg=[361.0, 0.0])), "s.csv", "-360..360"),
     (as_csv(GOOD.assign(dec_deg=[0.0, -91.0])), "s.csv", "row 2 has a declination"),
     (as_csv(GOOD.assign(mag=[99.0, 0.0])), "s.csv", "magnitude beyond 40"),

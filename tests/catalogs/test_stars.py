@@ -82,7 +82,9 @@ def test_every_star_is_in_a_cone_around_itself(index: StarIndex, sky: StarTable)
 
 def test_columns_survive_the_index(tmp_path: Path) -> None:
     stars = _table(np.array([10.0, 5.0]), np.array([1.0, 1.1]), epoch=np.array([1991.25, 2016.0]))
-    found = build_index(stars, "pair", "1" * 64, tmp_path).around(unit_vectors(np.array([7.5]), np.array([1.0]))[0], 0.1)
+    found = build_index(stars, "pair", "1" * 64, tmp_path).around(
+        unit_vectors(np.array([7.5]), np.array([1.0]))[0], 0.1
+    )
     assert found.star_id.tolist() == ["s1", "s0"]
     assert found.epoch.tolist() == [2016.0, 1991.25]
     assert np.isnan(found.pm_ra_masyr).all()
@@ -166,7 +168,9 @@ def test_no_star_takes_magnitudes_for_motion() -> None:
 def test_old_places_widen_the_search(tmp_path: Path) -> None:
     # A star as fast as Barnard's, catalogued in 1800: by 2015 it is 37 arcmin away from its place.
     epoch = np.array([1800.0])
-    stars = _table(np.array([0.0]), np.array([0.0]), pm_ra_masyr=np.zeros(1), pm_dec_masyr=np.array([10_300.0]), epoch=epoch)
+    stars = _table(
+        np.array([0.0]), np.array([0.0]), pm_ra_masyr=np.zeros(1), pm_dec_masyr=np.array([10_300.0]), epoch=epoch
+    )
     index = build_index(stars, "old", "4" * 64, tmp_path)
     et = 15 * 365.25 * 86400.0
     place = apparent_directions(stars, et, NOBODY)[0]
@@ -177,7 +181,11 @@ def test_aberration_and_parallax_widen_the_search() -> None:
     index = built_in_index("hipparcos", cache_folder())
     far = Spacecraft(np.array([0.0, 7e9, 0.0]), np.array([100.0, 0.0, 0.0]))
     for star in range(0, 50):
-        one = _proxima("hipparcos") if star == 0 else index.around(unit_vectors(np.array([star * 7.0]), np.array([star - 25.0]))[0], 0.02)
+        one = (
+            _proxima("hipparcos")
+            if star == 0
+            else index.around(unit_vectors(np.array([star * 7.0]), np.array([star - 25.0]))[0], 0.02)
+        )
         if len(one):
             seen = apparent_directions(one, 0.0, far)[0]
             assert one.star_id[0] in seen_from([index], seen, 1e-5, 0.0, far).star_id

@@ -87,7 +87,19 @@ def test_malformed_settings(setting: str) -> None:
     assert "--set" in refusal(settings=[setting])
 
 
-@pytest.mark.parametrize("data", [b"- a", b"text", b"a: [", b"\xff\xfe\x00", b"[" * 20_000, b"a: b: c", b"a: 2001-99-99", b"!!python/object:os.x {}"])
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"- a",
+        b"text",
+        b"a: [",
+        b"\xff\xfe\x00",
+        b"[" * 20_000,
+        b"a: b: c",
+        b"a: 2001-99-99",
+        b"!!python/object:os.x {}",
+    ],
+)
 def test_files_that_are_no_settings(tmp_path: Path, data: bytes) -> None:
     path = tmp_path / "mine.yaml"
     path.write_bytes(data)

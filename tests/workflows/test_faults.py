@@ -3,8 +3,9 @@
 import json
 import os
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 
 from tests.support import describe, document, pilotage, reasons, run_serial, some_frames, write_sidecar
 
-Pixels = NDArray[np.generic]
+Pixels = NDArray[Any]
 Spoil = Callable[[Path], None]
 
 
@@ -24,7 +25,11 @@ def _shorten(share: float) -> Spoil:
 
 
 def _bytes(data: bytes) -> Spoil:
-    return lambda frame: frame.write_bytes(data) and None
+    return lambda frame: _write(frame, data)
+
+
+def _write(path: Path, data: bytes) -> None:
+    path.write_bytes(data)
 
 
 def _pixels(change: Callable[[Pixels], Pixels]) -> Spoil:
@@ -50,11 +55,14 @@ def _cards(**cards: object) -> Spoil:
 
 
 def _sidecar(**changes: object) -> Spoil:
-    return lambda frame: write_sidecar(frame, **changes) and None
+    def spoil(frame: Path) -> None:
+        write_sidecar(frame, **changes)
+
+    return spoil
 
 
 def _sidecar_text(data: bytes) -> Spoil:
-    return lambda frame: frame.with_suffix(".geometry.json").write_bytes(data) and None
+    return lambda frame: _write(frame.with_suffix(".geometry.json"), data)
 
 
 def _stars(table: pd.DataFrame | bytes) -> Spoil:
@@ -84,7 +92,6 @@ class Fault:
     spoil: Spoil
     reason: str
     said: str = ""
-    also: tuple[str, ...] = field(default_factory=tuple)
 
 
 def _flat(value: float) -> Spoil:
@@ -99,7 +106,7 @@ FAULTS: dict[str, Fault] = {
     "cut_in_data": Fault(_shorten(0.2), "image_truncated"),
     "cut_in_extension": Fault(_shorten(0.95), "image_truncated"),
     "text": Fault(_bytes(b"[/red] not an image\n" * 500), "image_format_unknown", "[/red]"),
-    "garbage_after_simple": Fault(_bytes(b"SIMPLE  =                    T" + b"\xffgarbage" * 5000), "image_", ),
+    "garbage_after_simple": Fault(_bytes(b"SIMPLE  =                    T" + b"\xffgarbage" * 5000), "image_"),
     "nan": Fault(_flat(np.nan), "image_not_finite"),
     "infinite": Fault(_flat(np.inf), "image_not_finite"),
     "saturated": Fault(_flat(4095.0), "image_overexposed"),
@@ -166,7 +173,9 @@ def _good_frame(source: Path, folder: Path) -> Path:
     """An archive of the one frame with the most stars."""
     truth = json.loads((source / "truth.json").read_text())["frames"]
     frames = some_frames(source, folder, 99)
-    best = max(frames, key=lambda frame: float(truth[frame.stem]["n_stars"]) - 100 * bool(truth[frame.stem].get("trail_px")))
+    best = max(
+        frames, key=lambda frame: float(truth[frame.stem]["n_stars"]) - 100 * bool(truth[frame.stem].get("trail_px"))
+    )
     for frame in frames:
         if frame != best:
             frame.unlink()
@@ -246,7 +255,9 @@ def test_missing_file_of_a_list(lorri_archive: Path, tmp_path: Path) -> None:
     assert found["folder"] == "image_unreadable"
 
 
-@pytest.mark.parametrize(("geometry", "reason"), [("sidecar", "geometry_missing"), ("header", "navigated"), ("auto", "navigated")])
+@pytest.mark.parametrize(
+    ("geometry", "reason"), [("sidecar", "geometry_missing"), ("header", "navigated"), ("auto", "navigated")]
+)
 def test_sidecar_missing(lorri_archive: Path, tmp_path: Path, geometry: str, reason: str) -> None:
     good = _good_frame(lorri_archive, tmp_path / "a")
     assert _run_of(tmp_path / "a", geometry=geometry) == {good.stem: reason}
@@ -277,7 +288,8 @@ def test_missing_lines_are_left_out_or_too_many(lorri_archive: Path, tmp_path: P
 
 
 @pytest.mark.parametrize(
-    "dtype", ["u1", "i2", "u2", "i4", "f4", "f8"],
+    "dtype",
+    ["u1", "i2", "u2", "i4", "f4", "f8"],
 )
 def test_pixel_types_give_one_answer(lorri_archive: Path, tmp_path: Path, dtype: str) -> None:
     good = _good_frame(lorri_archive, tmp_path / "a")

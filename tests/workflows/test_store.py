@@ -63,7 +63,11 @@ def test_what_a_kill_leaves_is_swept(tmp_path: Path) -> None:
     folder = RunFolder(tmp_path / "run")
     with exclusive(folder):
         pass
-    left = [folder.root / f".plan.json.{TEMPORARY}", folder.images / f".a.json.{TEMPORARY}", folder.state / f".a.json.{TEMPORARY}"]
+    left = [
+        folder.root / f".plan.json.{TEMPORARY}",
+        folder.images / f".a.json.{TEMPORARY}",
+        folder.state / f".a.json.{TEMPORARY}",
+    ]
     for path in left:
         path.write_bytes(b"{")
     (folder.images / "a.json").write_bytes(b"{}")
