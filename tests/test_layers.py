@@ -45,7 +45,7 @@ def modules(package: str) -> Iterator[tuple[str, Path]]:
 
 
 def imports(path: Path) -> set[str]:
-    """Full names of all modules that a file imports, wherever in it; ``from a import b`` counts as a and, if a module, a.b."""
+    """Full names of all modules that a file imports, wherever in it; of ``from a import b`` a.b if that is a module."""
     found: set[str] = set()
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):

@@ -1,6 +1,7 @@
 """The command ``pilotage``."""
 
 import contextlib
+import logging
 import signal
 import sys
 import time
@@ -42,6 +43,7 @@ app = typer.Typer(
 app.add_typer(sample_cli.app, name="sample")
 app.add_typer(catalog_cli.app, name="catalog")
 
+_LOG = logging.getLogger("pilotage")
 _ARCHIVE_KEY = "archive."
 _LOG_EVERY_S = 5.0
 _LOG_WIDTH = 130
@@ -109,6 +111,7 @@ def run(
     config: ConfigOption = [],  # noqa: B006
     settings: SetOption = [],  # noqa: B006
     verify: VerifyOption = False,
+    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Log each technique's rotation.")] = False,
 ) -> None:
     """Navigate an archive; run again after a kill or a change, and only what is missing is done.
 
@@ -116,6 +119,9 @@ def run(
     """
     if serial and scheduler:
         raise ConfigurationError("--serial and --scheduler exclude each other")
+    if verbose:
+        logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(message)s")
+        _LOG.setLevel(logging.INFO)
     folder = RunFolder(output)
     # The death of a worker closes a socket under our hands, which is no reason to end.
     signal.signal(signal.SIGPIPE, signal.SIG_IGN)
@@ -138,6 +144,11 @@ def _follow(console: Console, work: Plan):  # type: ignore[no-untyped-def]
     """Progress bar on a terminal, plain lines in a log."""
     counts: Counter[str] = Counter()
     total, started = len(work.todo), time.monotonic()
+
+    def count(outcome: Outcome) -> None:
+        counts[outcome.status] += 1
+        for note in outcome.notes:
+            _LOG.info(note)
 
     def line() -> str:
         done = sum(counts.values())
@@ -162,7 +173,7 @@ def _follow(console: Console, work: Plan):  # type: ignore[no-untyped-def]
             task = progress.add_task("", total=total)
 
             def on_done(outcome: Outcome) -> None:
-                counts[outcome.status] += 1
+                count(outcome)
                 progress.update(task, advance=1, description=line())
 
             yield RunListener(lambda text: progress.console.print(text, highlight=False), on_done, start)
@@ -171,7 +182,7 @@ def _follow(console: Console, work: Plan):  # type: ignore[no-untyped-def]
 
     def log_done(outcome: Outcome) -> None:
         nonlocal last
-        counts[outcome.status] += 1
+        count(outcome)
         done = sum(counts.values())
         if time.monotonic() - last > _LOG_EVERY_S or done == total:
             last = time.monotonic()

@@ -3,6 +3,7 @@
 import hashlib
 import time
 import traceback
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -35,12 +36,13 @@ _PACKAGES = ("pipeline", "catalogs", "workflows")
 
 @dataclass(frozen=True)
 class Outcome:
-    """What the main process needs to know of a finished image."""
+    """What the main process needs to know of a finished image; ``notes`` are lines for its log, at INFO."""
 
     image_id: str
     status: str
     reason: str
     seconds: float
+    notes: tuple[str, ...] = ()
 
 
 class Stopwatch:
@@ -136,7 +138,8 @@ class ImageRunner:
         watch.lap("write")
         if lasting:
             self._mark(ref, inputs, hashlib.sha256(data).hexdigest(), watch)
-        return Outcome(ref.image_id, str(document["status"]), str(document["status_reason"]), watch.total())
+        status, reason = str(document["status"]), str(document["status_reason"])
+        return Outcome(ref.image_id, status, reason, watch.total(), rotation_notes(document))
 
     def _answer(self, ref: ImageRef, inputs: Inputs, watch: Stopwatch) -> tuple[dict[str, Json], bytes, bool]:
         """Document of an image whatever happens, its bytes, and whether the same inputs would give it again."""
@@ -197,7 +200,8 @@ class ImageRunner:
         data = inputs.data.get(path)
         if data is not None:
             try:
-                tables.append(read_table(data, path, apparent=False))
+                # An image's own table says where its stars are seen in it.
+                tables.append(read_table(data, path, apparent=True))
             except TableProblem as error:
                 raise CatalogError(StatusReason.CATALOG_INVALID, str(error)) from error
         return StarTable.concatenate(tables)
@@ -222,6 +226,28 @@ class ImageRunner:
             "inputs": inputs.marks(), "timings": {**watch.seconds, "total": watch.total()},
         }  # fmt: skip
         write_atomically(self._setup.run_folder.mark(ref.image_id), to_json(mark))
+
+
+def rotation_notes(document: Mapping[str, Json]) -> tuple[str, ...]:
+    """Lines with each technique's rotation, its sigma and whether its bound was reached (seed 000).
+
+    Parameters
+    ----------
+    document
+        An image's JSON document.
+
+    Returns
+    -------
+    tuple of str
+        One line per technique that observed a rotation.
+    """
+    answers = document["techniques"]
+    return tuple(
+        f"{document['image_id']} {answer['technique']}: rotation {answer['rotation_deg']:+.4f} deg, "
+        f"sigma {answer['sigma_rotation_deg']:.4f} deg{' AT_EDGE' if answer.get('at_edge_rotation') else ''}"
+        for answer in (answers if isinstance(answers, list) else [])
+        if isinstance(answer, dict) and answer.get("rotation_deg") is not None
+    )
 
 
 def _flags(raw: RawImage, block: InstrumentBlock | None) -> BoolArray | None:

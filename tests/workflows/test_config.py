@@ -34,7 +34,7 @@ SPOILED = [
     ("instruments: {nhlorri: {fit_camera_rotation: maybe}}", "instruments.nhlorri.fit_camera_rotation", "boolean"),
     ("instruments: {nhlorri: {search_margin_vu: [1]}}", "instruments.nhlorri.search_margin_vu", "required"),
     ("instruments: {nhlorri: {header: vicar}}", "instruments.nhlorri.header", "lorri"),
-    ("instruments: {nhlorri: {product_id_pattern: '('}}", "instruments.nhlorri.product_id_pattern", "regular expression"),
+    ("instruments: {nhlorri: {product_id_pattern: '('}}", "product_id_pattern", "regular expression"),
     ("instruments: {nhlorri: {modes: {1X1: {k_px_per_mm: [[1, 1], [1, 1]]}}}}", "k_px_per_mm", "inverse"),
     ("instruments: {nhlorri: {modes: {1X1: {focal_length_mm: 0}}}}", "focal_length_mm", "greater than 0"),
     ("instruments: {nhlorri: {fit_camera_rotation: true, max_rotation_deg: 0}}", "instruments.nhlorri", "above 0"),

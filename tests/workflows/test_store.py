@@ -112,9 +112,8 @@ def test_writing_replaces(tmp_path: Path) -> None:
 
 def _document(image_id: str, mission: str = "M", camera: str = "C") -> dict[str, Json]:
     provenance = Provenance("software", "digest", f"{image_id}.fits")
-    return {
-        **error_document(image_id, StatusReason.IMAGE_EMPTY, "no bytes", provenance), "mission": mission, "camera": camera
-    }  # fmt: skip
+    document = error_document(image_id, StatusReason.IMAGE_EMPTY, "no bytes", provenance)
+    return {**document, "mission": mission, "camera": camera}
 
 
 def _written(folder: RunFolder, *documents: dict[str, Json]) -> list[str]:
