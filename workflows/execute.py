@@ -10,9 +10,10 @@ from uuid import uuid4
 import dask
 from dask.utils import format_bytes, parse_bytes
 from distributed import Client, Future, KilledWorker, LocalCluster, Worker, WorkerPlugin, as_completed, get_worker
+from distributed.comm import CommClosedError
 
 from catalogs.archive import ImageRef
-from pipeline.errors import ConfigurationError
+from pipeline.errors import ConfigurationError, PilotageError
 from pipeline.status import Status, StatusReason
 from workflows.plan import Plan, Setup
 from workflows.store import to_json, write_atomically
@@ -109,12 +110,15 @@ def _run_on(client: Client, plan: Plan, on_done: Listener, on_ready: Callable[[s
     client.register_plugin(plugin, name=plugin.name)
     count = len(client.scheduler_info(n_workers=-1)["workers"])
     on_ready(f"{count} worker{'s' if count != 1 else ''}, dashboard {client.dashboard_link}")
-    lost = _drain(client, plugin.name, plan.todo, max(count, 1) * _IN_FLIGHT_PER_WORKER, on_done)
-    # An image may have died with its neighbour's worker. Alone, only its own death is counted.
-    for ref in lost:
-        for again in _drain(client, plugin.name, [ref], 1, on_done):
-            on_done(_record_loss(plan.setup, again))
-    client.unregister_worker_plugin(plugin.name)
+    try:
+        lost = _drain(client, plugin.name, plan.todo, max(count, 1) * _IN_FLIGHT_PER_WORKER, on_done)
+        # An image may have died with its neighbour's worker. Alone, only its own death is counted.
+        for ref in lost:
+            for again in _drain(client, plugin.name, [ref], 1, on_done):
+                on_done(_record_loss(plan.setup, again))
+        client.unregister_worker_plugin(plugin.name)
+    except CommClosedError as error:
+        raise PilotageError("the scheduler is gone; run the same command again to go on") from error
 
 
 def _await_workers(client: Client) -> None:
@@ -126,7 +130,9 @@ def _await_workers(client: Client) -> None:
 
 @contextmanager
 def _client(options: ClusterOptions) -> Iterator[Client]:
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)
+    # The client's logger has a level of its own.
+    for name in ("distributed", "distributed.client"):
+        logging.getLogger(name).setLevel(logging.CRITICAL)
     memory = _memory(options.memory_limit)
     with dask.config.set(
         {

@@ -52,11 +52,11 @@ class Running:
     def workers(self) -> list[psutil.Process]:
         """Worker processes that are alive."""
         children = [child for child in self._children() if "spawn_main" in " ".join(_command_of(child))]
-        return list(sorted(children, key=lambda child: int(child.pid)))
+        return sorted(children, key=lambda child: int(child.pid))
 
     def _children(self) -> list[psutil.Process]:
         try:
-            children = psutil.Process(self.process.pid).children(recursive=True)
+            children: list[psutil.Process] = psutil.Process(self.process.pid).children(recursive=True)
         except psutil.NoSuchProcess:
             return []
         self._seen.update(children)

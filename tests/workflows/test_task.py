@@ -1,4 +1,3 @@
-
 from pipeline.curate import Json
 from workflows.task import rotation_notes
 
