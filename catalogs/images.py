@@ -141,7 +141,10 @@ def _pixels_of(hdu: fits.PrimaryHDU, name: str) -> Image:
     with _forgiving(name):
         if hdu.data is None:
             raise ImageError(StatusReason.IMAGE_UNREADABLE, f"{name}: {hdu.name} holds no pixels")
-        return _native(np.squeeze(hdu.data))
+        pixels = _native(np.squeeze(hdu.data))
+        # HDUs refer to each other in circles: kept in one, the array would wait for the garbage collector.
+        del hdu.data
+        return pixels
 
 
 def _check_length(hdu: fits.PrimaryHDU, length: int, name: str) -> None:

@@ -176,17 +176,30 @@ def test_killing_workers_loses_nothing(
 
 
 @pytest.mark.slow
+def _interrupted(archive: Path, folder: Path) -> Running:
+    """A run that got a SIGINT after its first answer, and has ended."""
+    folder.mkdir()
+    running = Running(archive, folder / "run", "--workers", 2)
+    assert running.wait_until(lambda: running.done() >= 1)
+    running.process.send_signal(signal.SIGINT)
+    running.ended()
+    return running
+
+
 def test_an_interrupted_run_says_so_and_goes_on(
     lorri_archive: Path, tmp_path: Path, undisturbed: dict[str, bytes]
 ) -> None:
-    running = Running(lorri_archive, tmp_path / "run", "--workers", 2)
-    assert running.wait_until(lambda: running.done() >= 3)
-    running.process.send_signal(signal.SIGINT)
+    # A fast machine may be through before the signal arrives: three tries.
+    for attempt in range(3):
+        folder = tmp_path / f"try-{attempt}"
+        running = _interrupted(lorri_archive, folder)
+        if running.ended() == 130:
+            break
     assert running.ended() == 130
     assert "run the same command again" in running.log()
     assert "Traceback" not in running.log()
-    run_serial(lorri_archive, tmp_path / "run")
-    assert answers(tmp_path / "run") == undisturbed
+    run_serial(lorri_archive, folder / "run")
+    assert answers(folder / "run") == undisturbed
 
 
 @pytest.mark.slow
