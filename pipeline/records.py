@@ -8,6 +8,7 @@ positions are ``(n, 2)`` in that order and end in ``_vu``. ``predicted + offset 
 """
 
 from dataclasses import dataclass, field, fields
+from enum import StrEnum
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
@@ -185,6 +186,95 @@ class Spacecraft(Record):
         self._freeze(position_km=(3,), velocity_km_s=(3,))
 
 
+class Photometry(StrEnum):
+    """Law by which a surface scatters light; parameters stand with the functions in ``imaging/illumination.py``."""
+
+    LAMBERT = "lambert"
+    LOMMEL_SEELIGER = "lommel_seeliger"
+    LUNAR_LAMBERT = "lunar_lambert"
+    MCEWEN = "mcewen"
+    MINNAERT = "minnaert"
+
+
+@dataclass(frozen=True, eq=False)
+class TriangleMesh(Record):
+    """Shape of a body as triangles.
+
+    Attributes
+    ----------
+    vertices_km
+        (n, 3) body-fixed.
+    facets
+        (m, 3) vertex indices, counter-clockwise seen from outside.
+    """
+
+    vertices_km: FloatArray
+    facets: NDArray[np.int64]
+
+    def __post_init__(self) -> None:
+        self._freeze(vertices_km=(None, 3), facets=(None, 3))
+        if not len(self.facets) or self.facets.min() < 0 or self.facets.max() >= len(self.vertices_km):
+            raise ContractError("facets name vertices that are not there")
+        if not np.isfinite(self.vertices_km).all():
+            raise ContractError("a vertex is not finite")
+
+
+@dataclass(frozen=True, eq=False)
+class Body(Record):
+    """One planet, moon or small body as the camera sees it: light time and stellar aberration are in its place.
+
+    Attributes
+    ----------
+    name, naif_id
+        Identity; the id is None where nobody gave one.
+    position_km
+        (3,) apparent, from the spacecraft, J2000 axes.
+    radii_km
+        (3,) semi-axes along the body-fixed axes; for a mesh those of its bounding ellipsoid.
+    body_from_j2000
+        (3, 3) orientation when the light left it.
+    sun_direction_j2000
+        (3,) unit vector from the body to the Sun.
+    photometry
+        Scattering law.
+    photometry_parameter
+        The law's one free parameter (lunar-Lambert weight, Minnaert exponent), None for its default.
+    mesh
+        Shape where it is no ellipsoid.
+    shape_sigma_km
+        1 sigma of the surface's height about the shape (topography and errors of the shape); None where unknown.
+    shape_correlation_deg
+        Angle at the body's centre over which those heights are alike (e-folding of their covariance).
+    haze_km
+        Scale height of an atmosphere that softens the limb; zero for an airless body.
+    """
+
+    name: str
+    naif_id: int | None
+    position_km: FloatArray
+    radii_km: FloatArray
+    body_from_j2000: FloatArray
+    sun_direction_j2000: FloatArray
+    photometry: Photometry = Photometry.LAMBERT
+    photometry_parameter: float | None = None
+    mesh: TriangleMesh | None = None
+    shape_sigma_km: float | None = None
+    shape_correlation_deg: float = 5.0
+    haze_km: float = 0.0
+
+    def __post_init__(self) -> None:
+        self._freeze(position_km=(3,), radii_km=(3,), body_from_j2000=(3, 3), sun_direction_j2000=(3,))
+        if not (np.isfinite(self.position_km).all() and np.linalg.norm(self.position_km) > 0):
+            raise ContractError(f"{self.name}: position {self.position_km.tolist()} km")
+        if not (np.isfinite(self.radii_km).all() and (self.radii_km > 0).all()):
+            raise ContractError(f"{self.name}: radii {self.radii_km.tolist()} km must be positive")
+        rotation = self.body_from_j2000
+        if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-9) or np.linalg.det(rotation) < 0:
+            raise ContractError(f"{self.name}: body_from_j2000 is not a rotation")
+        if abs(float(np.linalg.norm(self.sun_direction_j2000)) - 1.0) > 1e-6:
+            raise ContractError(f"{self.name}: sun_direction_j2000 is not a unit vector")
+
+
 @dataclass(frozen=True)
 class State:
     """Geometry of one image, whichever provider filled it.
@@ -197,6 +287,8 @@ class State:
         Mid-exposure: TDB seconds past J2000, and ISO-8601 UTC.
     exposure_s
         Exposure, None when unknown.
+    bodies
+        Everything solid that can be in or near the field, the Sun aside; nearest first.
     """
 
     image_id: str
@@ -210,6 +302,7 @@ class State:
     attitude: Attitude
     spacecraft: Spacecraft
     settings: InstrumentSettings
+    bodies: tuple[Body, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
