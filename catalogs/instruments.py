@@ -7,10 +7,12 @@ import numpy as np
 from pydantic import AfterValidator, Field
 
 from pipeline.options import InstrumentSettings, Options
-from pipeline.records import CameraModel, Detector
+from pipeline.records import CameraModel, Detector, FloatArray
 
 Pair = tuple[float, float]
 Triple = tuple[float, float, float]
+# Matrices are written with a handful of digits; a wrong sign is off by more.
+_ROTATION_TOLERANCE = 1e-5
 
 
 def _invertible(matrix: tuple[Pair, Pair]) -> tuple[Pair, Pair]:
@@ -20,12 +22,36 @@ def _invertible(matrix: tuple[Pair, Pair]) -> tuple[Pair, Pair]:
     return matrix
 
 
+def _rotation(matrix: tuple[Triple, Triple, Triple]) -> tuple[Triple, Triple, Triple]:
+    array = np.array(matrix)
+    if not np.allclose(array @ array.T, np.eye(3), atol=_ROTATION_TOLERANCE) or np.linalg.det(array) < 0:
+        raise ValueError("the matrix must be a rotation")
+    return matrix
+
+
 def _regular_expression(text: str) -> str:
     try:
         re.compile(text)
     except re.error as error:
         raise ValueError(f"no regular expression: {error}") from error
     return text
+
+
+class SpiceNames(Options):
+    """What SPICE calls a camera, and how its frame lies in it."""
+
+    spacecraft_id: int = Field(ge=-999999, lt=0, description="NAIF id of the spacecraft")
+    instrument_id: int = Field(lt=0, description="NAIF id of the camera, which its instrument kernel uses")
+    frame: str = Field(min_length=1, max_length=32, description="frame whose orientation the kernels give")
+    camera_from_instrument: Annotated[tuple[Triple, Triple, Triple], AfterValidator(_rotation)] = Field(
+        ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
+        description="rotation from that frame to the camera frame (z out of the lens)",
+    )
+
+    def rotation(self) -> FloatArray:
+        """(3, 3) camera_from_instrument, orthonormal to the last digit whatever was written."""
+        u, _, vt = np.linalg.svd(np.array(self.camera_from_instrument))
+        return np.asarray(u @ vt)
 
 
 class CameraMode(Options):
@@ -74,5 +100,6 @@ class InstrumentBlock(InstrumentSettings):
     product_id_pattern: Annotated[str, AfterValidator(_regular_expression)] | None = Field(
         None, description="regular expression of a file stem that is a product id"
     )
+    spice: SpiceNames | None = Field(None, description="names for the spice provider; without them it cannot be used")
     quality_extension: str | None = Field(None, description="name of the extension whose non-zero pixels are bad")
     modes: dict[str, CameraMode] = Field(min_length=1, description="read-out modes by name")
