@@ -16,8 +16,10 @@ from fsspec.spec import AbstractFileSystem
 from fsspec.utils import glob_translate
 from pydantic import Field, ValidationError
 
-from catalogs.geometry import first_problem, sidecar_image_id
+from catalogs.bodies import BodyBlock
+from catalogs.geometry import first_problem
 from catalogs.instruments import InstrumentBlock
+from catalogs.sidecar import sidecar_image_id
 from pipeline.errors import ConfigurationError
 from pipeline.options import Options
 
@@ -45,6 +47,9 @@ class ArchiveDescription(Options):
     instrument: str | None = Field(None, description="a camera block; by default the header is recognised")
     stars: str | list[str | StarTableRef] = Field("per-image", description="built-in names, tables, or per-image")
     settings: dict[str, object] = Field(default_factory=dict, description="instrument settings that win")
+    bodies: dict[str, BodyBlock] = Field(
+        default_factory=dict, description="what this archive knows of bodies, by name; wins key by key"
+    )
 
 
 @dataclass(frozen=True)

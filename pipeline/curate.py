@@ -52,6 +52,8 @@ class Provenance:
         Provider, and digest of what it read.
     catalogs
         (name, sha256) of each star table.
+    shapes, kernels
+        (name, sha256) of each shape file and SPICE kernel, kernels in the order in which they were loaded.
     """
 
     software: str
@@ -61,6 +63,8 @@ class Provenance:
     geometry_source: str | None = None
     geometry_sha256: str | None = None
     catalogs: tuple[tuple[str, str], ...] = ()
+    shapes: tuple[tuple[str, str], ...] = ()
+    kernels: tuple[tuple[str, str], ...] = ()
 
 
 def build_metadata_dict(navigation: Navigation, options: RankOptions, provenance: Provenance) -> dict[str, Json]:
@@ -254,5 +258,10 @@ def _provenance(provenance: Provenance) -> dict[str, Json]:
         "software": provenance.software, "config_digest": provenance.config_digest, "image_path": provenance.image_path,
         "image_sha256": provenance.image_sha256, "geometry_source": provenance.geometry_source,
         "geometry_sha256": provenance.geometry_sha256,
-        "catalogs": [{"name": name, "sha256": sha256} for name, sha256 in provenance.catalogs],
+        "catalogs": _digests(provenance.catalogs), "shapes": _digests(provenance.shapes),
+        "kernels": _digests(provenance.kernels),
     }  # fmt: skip
+
+
+def _digests(files: tuple[tuple[str, str], ...]) -> Json:
+    return [{"name": name, "sha256": sha256} for name, sha256 in files]

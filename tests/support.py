@@ -14,7 +14,7 @@ import pytest
 import yaml
 from astropy.io import fits
 
-from catalogs.geometry import state_from_header
+from catalogs.header import state_from_header
 from catalogs.images import read_image
 from pipeline.geometry.rotations import quaternion_from_matrix
 from pipeline.records import FloatArray, State
@@ -83,6 +83,13 @@ def describe(folder: Path, **changes: object) -> None:
 def document(run: Path, image_id: str) -> Document:
     """Document of an image."""
     content = json.loads((run / "images" / f"{image_id}.json").read_bytes())
+    assert isinstance(content, dict)
+    return content
+
+
+def inputs_of(run: Path, image_id: str) -> dict[str, object]:
+    """What an image was made from, by its mark."""
+    content = json.loads((run / "state" / f"{image_id}.json").read_bytes())["inputs"]
     assert isinstance(content, dict)
     return content
 

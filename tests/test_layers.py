@@ -36,7 +36,10 @@ OUTSIDE_OF_SCIENCE = {
     "typer", "rich", "os", "pathlib", "time", "datetime", "io", "glob", "shutil", "tempfile", "subprocess", "random",
 }  # fmt: skip
 # Schemas are Arrow's, which is not a file.
-ORDER_OF_CATALOGS = ("instruments", "images", "geometry", "archive", "star_sources", "stars")
+ORDER_OF_CATALOGS = (
+    "instruments", "images", "bodies", "shapes", "geometry", "header", "sidecar", "archive", "spice", "star_sources",
+    "stars",
+)  # fmt: skip
 
 
 def modules(package: str) -> Iterator[tuple[str, Path]]:

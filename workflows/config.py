@@ -9,6 +9,7 @@ from pathlib import Path
 import yaml
 from pydantic import BaseModel, Field, ValidationError
 
+from catalogs.bodies import BodyBlock
 from catalogs.instruments import InstrumentBlock
 from pipeline.curate import RankOptions
 from pipeline.ensemble import EnsembleOptions
@@ -35,6 +36,7 @@ class Configuration(Options):
     """Everything that can be set."""
 
     instruments: dict[str, InstrumentBlock] = Field(default_factory=dict, description="camera blocks by name")
+    bodies: dict[str, BodyBlock] = Field(default_factory=dict, description="planets, moons and small bodies by name")
     frame: FrameOptions = FrameOptions()
     detection: DetectionOptions = DetectionOptions()
     stars: StarPredictionOptions = StarPredictionOptions()

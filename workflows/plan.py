@@ -21,6 +21,7 @@ from catalogs.archive import (
     list_images,
     stem,
 )
+from catalogs.bodies import BodyBlock, merged_blocks
 from catalogs.geometry import first_problem
 from catalogs.star_sources import TableProblem, read_table
 from catalogs.stars import BUILT_IN_NAMES, StarIndex, added_index, build_index, built_in_index, cache_folder, open_index
@@ -78,10 +79,17 @@ class Setup:
         return hashlib.sha256(json.dumps(parts).encode()).hexdigest()
 
     @cached_property
+    def bodies(self) -> dict[str, BodyBlock]:
+        """Blocks of bodies by name, the archive's word on top of the configuration's."""
+        return merged_blocks(self.configuration.bodies, self.archive.description.bodies)
+
+    @cached_property
     def _shared_digest(self) -> str:
         """Digest of what all images have in common: computed once, for it costs as much as a fast stage."""
         description = self.archive.description.model_dump(mode="json", exclude={"name", "images"})
-        parts: list[object] = [self.configuration.digest(), self.software, description, list(self.star_digests)]
+        # Which keys of a body's block are said decides what they hide, which their values alone do not tell.
+        bodies = {name: block.model_dump(mode="json") for name, block in self.bodies.items()}
+        parts: list[object] = [self.configuration.digest(), self.software, description, bodies, list(self.star_digests)]
         return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
 
 
@@ -211,7 +219,8 @@ def _is_done(ref: ImageRef, setup: Setup, verify: bool) -> bool:
     if mark is None or mark.get("document_sha256") != _digest_of_document(setup.run_folder, ref.image_id):
         return False
     recorded = mark.get("inputs")
-    if not isinstance(recorded, dict) or set(recorded) != set(setup.inputs_of(ref)):
+    # Beside these an answer has inputs that others name: the shape file of a sidecar.
+    if not isinstance(recorded, dict) or not set(recorded) >= set(setup.inputs_of(ref)):
         return False
     digests: dict[str, str | None] = {}
     for path, entry in recorded.items():

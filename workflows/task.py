@@ -8,14 +8,18 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from posixpath import dirname
 
 import cv2
 import numpy as np
 
 from catalogs.archive import SIDECAR_SUFFIX, STARS_SUFFIX, Archive, ImageRef, file_stamp, stem
-from catalogs.geometry import identify, state_from_header, state_from_sidecar
+from catalogs.bodies import BodyModels
+from catalogs.header import state_from_header
 from catalogs.images import RawImage, read_image
-from catalogs.instruments import InstrumentBlock
+from catalogs.instruments import InstrumentBlock, identify
+from catalogs.shapes import read_shape
+from catalogs.sidecar import state_from_sidecar
 from catalogs.star_sources import TableProblem, read_table
 from catalogs.stars import open_index, seen_from
 from pipeline.camera import field_of_view
@@ -23,7 +27,7 @@ from pipeline.curate import Json, Provenance, build_metadata_dict, error_documen
 from pipeline.errors import CatalogError, GeometryError, ImageError, ImageFailure
 from pipeline.navigate import Navigation, navigate
 from pipeline.predict.stars import reach_px
-from pipeline.records import BoolArray, StarTable, State
+from pipeline.records import BoolArray, StarTable, State, TriangleMesh
 from pipeline.status import StatusReason
 from workflows.plan import Setup
 from workflows.store import to_json, write_atomically
@@ -34,6 +38,7 @@ _BUGS = (
     ValueError,
 )  # fmt: skip
 _PACKAGES = ("pipeline", "catalogs", "workflows")
+_MESHES_KEPT = 16
 
 
 @dataclass(frozen=True)
@@ -93,6 +98,10 @@ class Inputs:
             return
         self.data[path], self.digests[path] = data, hashlib.sha256(data).hexdigest()
 
+    def took(self, path: str, stamp: tuple[int, str] | None, sha256: str) -> None:
+        """Note a file that was read for an earlier image and is as it was."""
+        self._stamps[path], self.digests[path] = stamp, sha256
+
     def marks(self) -> dict[str, Json]:
         """Digest, size and modification mark of each, as JSON values."""
         marks: dict[str, Json] = {}
@@ -100,6 +109,48 @@ class Inputs:
             stamp = self._stamps[path] if sha256 is not None else None
             marks[path] = {"sha256": sha256, "size": stamp[0] if stamp else None, "mark": stamp[1] if stamp else None}
         return marks
+
+
+class Meshes:
+    """Shape files of the bodies, each parsed once per process as long as it does not change.
+
+    Parameters
+    ----------
+    archive
+        To whose root paths are relative.
+    """
+
+    def __init__(self, archive: Archive) -> None:
+        self._archive = archive
+        self._known: dict[str, tuple[tuple[int, str], str, TriangleMesh]] = {}
+
+    def read(self, path: str, inputs: Inputs) -> TriangleMesh:
+        """Mesh of a file, which becomes an input of the image.
+
+        Raises
+        ------
+        GeometryError
+            If there is no such file, or it is damaged.
+        """
+        stamp = file_stamp(self._archive.url, path)
+        if stamp is not None and path in self._known and self._known[path][0] == stamp:
+            _, sha256, mesh = self._known[path]
+            inputs.took(path, stamp, sha256)
+            return mesh
+        try:
+            inputs.read(path)
+        except IsADirectoryError as error:
+            raise GeometryError(StatusReason.GEOMETRY_INVALID, f"shape {path} is a folder") from error
+        data, digest = inputs.data.pop(path), inputs.digests[path]
+        if data is None or digest is None:
+            raise GeometryError(StatusReason.GEOMETRY_MISSING, f"shape {path} is not there")
+        mesh = read_shape(data, path)
+        if stamp is not None:
+            # The oldest goes first; few archives hold more bodies than this.
+            if len(self._known) >= _MESHES_KEPT:
+                del self._known[next(iter(self._known))]
+            self._known[path] = (stamp, digest, mesh)
+        return mesh
 
 
 @contextmanager
@@ -133,6 +184,7 @@ class ImageRunner:
         self._indexes = [open_index(path) for path in setup.star_indexes]
         self._options = setup.configuration.navigation()
         self._config_digest = setup.configuration.digest()
+        self._meshes = Meshes(setup.archive)
 
     def run(self, ref: ImageRef) -> Outcome:
         """Navigate one image and write its document, then its mark.
@@ -200,8 +252,11 @@ class ImageRunner:
         path = stem(ref.path) + SIDECAR_SUFFIX
         sidecar = inputs.data.get(path)
         if sidecar is not None:
-            shape = raw.pixels.shape
-            return state_from_sidecar(sidecar, ref.image_id, block, description.settings, shape), block, "sidecar"
+            models = BodyModels(self._setup.bodies, lambda shape: self._meshes.read(shape, inputs), dirname(path))
+            state = state_from_sidecar(
+                sidecar, ref.image_id, block, description.settings, raw.pixels.shape, models
+            )  # fmt: skip
+            return state, block, "sidecar"
         if description.geometry == "sidecar":
             raise GeometryError(StatusReason.GEOMETRY_MISSING, f"{path} is not there")
         if block is None:
@@ -229,9 +284,11 @@ class ImageRunner:
         table = inputs.digests.get(stem(ref.path) + STARS_SUFFIX)
         catalogs = (*self._setup.star_digests, *((("per-image", table),) if table else ()))
         image = inputs.digests.get(ref.path)
+        listed = set(self._setup.inputs_of(ref))
+        shapes = ((name, sha256) for name, sha256 in sorted(inputs.digests.items()) if name not in listed and sha256)
         return Provenance(
             self._setup.software, self._config_digest, ref.path, image, source,
-            {"sidecar": sidecar, "header": image}.get(source or ""), catalogs,
+            {"sidecar": sidecar, "header": image}.get(source or ""), catalogs, tuple(shapes),
         )  # fmt: skip
 
     def _error(self, ref: ImageRef, inputs: Inputs, reason: StatusReason, detail: str) -> dict[str, Json]:

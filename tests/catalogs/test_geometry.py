@@ -8,9 +8,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from catalogs.geometry import et_of_utc, identify, sidecar_image_id, state_from_header, state_from_sidecar
+from catalogs.geometry import et_of_utc
+from catalogs.header import state_from_header
 from catalogs.images import RawImage, read_image
-from catalogs.instruments import InstrumentBlock
+from catalogs.instruments import InstrumentBlock, identify
+from catalogs.sidecar import sidecar_image_id, state_from_sidecar
 from pipeline.errors import GeometryError, ImageFailure
 from pipeline.records import State
 from pipeline.status import StatusReason

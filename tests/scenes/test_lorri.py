@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 from astropy.io import fits
 
-from catalogs.geometry import state_from_header
+from catalogs.header import state_from_header
 from catalogs.images import read_image
 from catalogs.star_sources import gaia_stars, read_table
 from pipeline.camera import project
