@@ -1,87 +1,56 @@
-"""Image files: bytes to pixels, header and the product's own bad-pixel flags."""
+"""Image files: bytes to pixels, keywords of the label, and the product's own bad-pixel flags.
 
-import math
-import struct
-import warnings
-import zlib
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
-from dataclasses import dataclass
-from functools import partial
-from io import BytesIO
+Formats are told by content: FITS, VICAR, ISIS cubes, PDS3 with the label in front, and PDS3 or PDS4 with the label in
+a file of its own.
+"""
 
-import numpy as np
-from astropy.io import fits
-from astropy.io.fits.hdu.compressed._compression import CfitsioException
-from astropy.io.fits.verify import VerifyError, VerifyWarning
-from astropy.utils.exceptions import AstropyUserWarning
+from collections.abc import Iterator, Mapping
 
+from catalogs.fits_images import read_fits
+from catalogs.gdal_images import isis_pixels, pds4_file, pds4_pixels, scaled, special_pixels, vicar_pixels
+from catalogs.instruments import CardValue, Header
+from catalogs.label_text import Keywords, attached_label, parse_label, parse_pds4, parse_vicar
+from catalogs.pds3_images import Pointer, pds3_pixels, pointer_of
+from catalogs.raw_images import RawImage
 from pipeline.errors import ImageError
 from pipeline.records import Image
 from pipeline.status import StatusReason
 
-CardValue = str | int | float | bool
-_BLOCK = 2880
-# What astropy lets through when a file is damaged.
-_DAMAGE = (
-    OSError, ValueError, TypeError, LookupError, AttributeError, ArithmeticError, VerifyError, MemoryError, EOFError,
-    struct.error, zlib.error, CfitsioException,
-)  # fmt: skip
+__all__ = ["RawImage", "labelled_file", "read_image"]
+
+# How labels begin: PDS3, its predecessors on the first disks, and ISIS cubes.
+_KEYWORD_STARTS = (b"PDS_VERSION_ID", b"CCSD3", b"NJPL", b"ODL_VERSION_ID", b"FILE_TYPE", b"RECORD_TYPE", b"Object")
+_MISSING_KEYS = ("IMAGE.MISSING_CONSTANT", "IMAGE.INVALID_CONSTANT", "IMAGE.MISSING", "IMAGE.NULL_CONSTANT")
 
 
-class Cards(Mapping[str, CardValue]):
-    """Cards of a header; one that cannot be parsed, or has no value, counts as not there.
+class _Joined(Mapping[str, CardValue]):
+    """Cards of a header, and keywords of a label beside it for what the cards do not say."""
 
-    astropy parses a card when it is asked for, and it stays that way: a product has hundreds, a few are wanted.
-    """
-
-    def __init__(self, header: fits.Header) -> None:
-        self._header = header
+    def __init__(self, cards: Header, keywords: Header) -> None:
+        self._cards, self._keywords = cards, keywords
 
     def __getitem__(self, key: str) -> CardValue:
-        try:
-            value = self._header[key]
-        except VerifyError as error:
-            raise KeyError(key) from error
-        if not isinstance(value, str | int | float | bool):
-            raise KeyError(key)
-        return value
+        value = self._cards.get(key)
+        return self._keywords[key] if value is None else value
 
     def __iter__(self) -> Iterator[str]:
-        return iter(self._header)
+        return iter(dict.fromkeys((*self._cards, *self._keywords)))
 
     def __len__(self) -> int:
-        return len(self._header)
+        return len(dict.fromkeys((*self._cards, *self._keywords)))
 
 
-@dataclass(frozen=True)
-class RawImage:
-    """What a file holds.
-
-    Attributes
-    ----------
-    pixels
-        (rows, cols) as stored, native byte order, floats no longer than 32 bits.
-    header
-        Cards of the image's header.
-    extensions
-        Readers of the file's further two-dimensional images, by name in upper case; they raise ImageError.
-    """
-
-    pixels: Image
-    header: Mapping[str, CardValue]
-    extensions: Mapping[str, Callable[[], Image]]
-
-
-def read_image(data: bytes, name: str) -> RawImage:
+def read_image(data: bytes, name: str, companions: Mapping[str, bytes] | None = None) -> RawImage:
     """Read an image from the bytes of its file.
 
     Parameters
     ----------
     data
-        The whole file.
+        The whole file: pixels, or a label that names the file of its pixels.
     name
         For messages.
+    companions
+        Files that belong to it, by name: its detached label, or the pixels of a label.
 
     Returns
     -------
@@ -91,98 +60,120 @@ def read_image(data: bytes, name: str) -> RawImage:
     Raises
     ------
     ImageError
-        If the file is empty, truncated, of a format that is not read, or damaged.
+        If the file is empty, truncated, of a format that is not read, damaged, or lacks the file that its label names.
     """
     if not data:
         raise ImageError(StatusReason.IMAGE_EMPTY, f"{name} has no bytes")
-    if not data.startswith(b"SIMPLE  ="):
-        start = data[:8]
-        raise ImageError(StatusReason.IMAGE_FORMAT_UNKNOWN, f"{name} is not a FITS file: it starts with {start!r}")
-    if len(data) < _BLOCK:
-        raise ImageError(StatusReason.IMAGE_TRUNCATED, f"{name} ends inside its header")
-    with _forgiving(name):
-        return _read_fits(data, name)
+    companions = companions or {}
+    named = labelled_file(data)
+    if named is not None:
+        pixels = next((found for file, found in companions.items() if file.lower() == named.lower()), None)
+        if pixels is None:
+            raise ImageError(StatusReason.IMAGE_NOT_FOUND, f"{name}: {named}, which it names, is not there")
+        return read_image(pixels, named, {name: data})
+    label = next((text for text in companions.values() if _is_label(text)), None)
+    try:
+        return _read(data, name, label)
+    except ValueError as error:
+        raise ImageError(StatusReason.IMAGE_UNREADABLE, f"{name}: {' '.join(str(error).split())}") from error
 
 
-@contextmanager
-def _forgiving(name: str) -> Iterator[None]:
-    """Silence for small breaches of the standard, an ImageError for damage."""
-    with warnings.catch_warnings():
-        # Old products break the standard in small ways (NEAR's cards do); what matters is checked below.
-        warnings.simplefilter("ignore", VerifyWarning)
-        warnings.simplefilter("ignore", AstropyUserWarning)
-        try:
-            yield
-        except _DAMAGE as error:
-            text = " ".join(str(error).split()) or type(error).__name__
-            raise ImageError(StatusReason.IMAGE_UNREADABLE, f"{name}: {text}") from error
+def _is_label(data: bytes) -> bool:
+    return data.lstrip()[:32].startswith((*_KEYWORD_STARTS, b"<?xml", b"<Product"))
 
 
-def _read_fits(data: bytes, name: str) -> RawImage:
-    hdus = fits.open(BytesIO(data), memmap=False, lazy_load_hdus=True)
-    # What stands behind the first pixels (flags, errors) is never the image, even where these are none.
-    first = next((hdu for hdu in hdus if hdu.is_image and hdu.header.get("NAXIS", 0) >= 1), None)
-    if first is None or first.header["NAXIS"] < 2:
-        if len(data) % _BLOCK or len(data) <= _BLOCK:
-            raise ImageError(StatusReason.IMAGE_TRUNCATED, f"{name} ends inside its header")
-        raise ImageError(StatusReason.IMAGE_UNREADABLE, f"{name} holds no two-dimensional image")
-    for hdu in hdus:
-        _check_length(hdu, len(data), name)
-    _check_rest(hdus, data, name)
-    extensions = {
-        hdu.name.upper(): partial(_pixels_of, hdu, name)
-        for hdu in hdus
-        if hdu is not first and hdu.is_image and hdu.name
-    }
-    return RawImage(_pixels_of(first, name), Cards(first.header), extensions)
+def _is_xml(data: bytes) -> bool:
+    return data.lstrip()[:9].startswith((b"<?xml", b"<Product"))
 
 
-def _pixels_of(hdu: fits.PrimaryHDU, name: str) -> Image:
-    with _forgiving(name):
-        if hdu.data is None:
-            raise ImageError(StatusReason.IMAGE_UNREADABLE, f"{name}: {hdu.name} holds no pixels")
-        pixels = _native(np.squeeze(hdu.data))
-        # HDUs refer to each other in circles: kept in one, the array would wait for the garbage collector.
-        del hdu.data
-        return pixels
+def labelled_file(data: bytes) -> str | None:
+    """Name of the file whose pixels a label describes, where that is another file.
+
+    Parameters
+    ----------
+    data
+        Any file.
+
+    Returns
+    -------
+    str or None
+        Without folders; None where the file is no label, holds its own pixels, or cannot be understood.
+    """
+    if not _is_label(data):
+        return None
+    try:
+        if _is_xml(data):
+            return pds4_file(parse_pds4(data))
+        text = attached_label(data)
+        pointer = None if text is None else pointer_of(_flat(text))
+    except ValueError:
+        return None
+    return None if pointer is None or pointer.file is None else pointer.file.rpartition("/")[2]
 
 
-def _check_length(hdu: fits.PrimaryHDU, length: int, name: str) -> None:
-    """Data units must end before the file does; only the padding of the last block may be missing."""
-    info = hdu.fileinfo()
-    if isinstance(hdu, fits.CompImageHDU):
-        # Its header tells the size of the image, not of the table that holds it.
-        end = info["datLoc"] + info["datSpan"] - (_BLOCK - 1)
-    else:
-        end = info["datLoc"] + _data_bytes(hdu.header)
-    if end > length:
-        share = length / end
-        raise ImageError(StatusReason.IMAGE_TRUNCATED, f"{name} has {length} bytes of {end} ({share:.0%})")
+def _flat(text: str) -> Keywords:
+    return parse_label(text).flat()
 
 
-def _check_rest(hdus: fits.HDUList, data: bytes, name: str) -> None:
-    """Bytes after the last unit may be anything, but not an extension that astropy has given up on."""
-    info = hdus[-1].fileinfo()
-    rest = data[info["datLoc"] + info["datSpan"] :]
-    if rest.startswith(b"XTENSION"):
-        whole = len(rest) >= _BLOCK and len(data) % _BLOCK == 0
-        reason = StatusReason.IMAGE_UNREADABLE if whole else StatusReason.IMAGE_TRUNCATED
-        raise ImageError(reason, f"{name}: the header of extension {len(hdus)} is damaged or cut off")
+def _read(data: bytes, name: str, label: bytes | None) -> RawImage:
+    beside: Keywords = {}
+    if label is not None:
+        beside = parse_pds4(label) if _is_xml(label) else _flat(attached_label(label) or label.decode("latin-1"))
+    if data.startswith(b"SIMPLE  ="):
+        raw = read_fits(data, name)
+        return RawImage(raw.pixels, _Joined(raw.header, beside), raw.extensions) if beside else raw
+    if data.startswith(b"LBLSIZE="):
+        own = _vicar_label(data)
+        return RawImage(vicar_pixels(data, own, name), own | beside, {})
+    if data.startswith(_KEYWORD_STARTS) and (text := attached_label(data)) is not None:
+        return _read_labelled(data, _flat(text), beside, name)
+    if label is not None and _is_xml(label):
+        return RawImage(pds4_pixels(data, label, beside, name), beside, {})
+    if label is not None:
+        return RawImage(_pds3(data, beside, pointer_of(beside), name), beside, {})
+    raise ImageError(
+        StatusReason.IMAGE_FORMAT_UNKNOWN,
+        f"{name} is neither FITS, VICAR, ISIS nor PDS: it starts with {data[:8]!r} and has no label",
+    )
 
 
-def _data_bytes(header: fits.Header) -> int:
-    axes = [header[f"NAXIS{k + 1}"] for k in range(header.get("NAXIS", 0))]
-    if not axes:
-        return 0
-    elements = math.prod(axes)
-    return int(abs(header["BITPIX"]) // 8 * header.get("GCOUNT", 1) * (header.get("PCOUNT", 0) + elements))
+def _read_labelled(data: bytes, own: Keywords, beside: Keywords, name: str) -> RawImage:
+    """Image with its keywords in front."""
+    if "IsisCube.Core.StartByte" in own:
+        return RawImage(isis_pixels(data, own, name), own | beside, {})
+    pointers = (pointer_of(own, key) for key in ("IMAGE_HEADER", "VICAR_HEADER"))
+    vicar = next((p.offset for p in pointers if p is not None), None)
+    inner = _vicar_label(data[vicar:]) if vicar and data.startswith(b"LBLSIZE=", vicar) else {}
+    return RawImage(_pds3(data, own, pointer_of(own), name), inner | own | beside, {})
 
 
-def _native(array: Image) -> Image:
-    if array.dtype.kind == "f" and array.dtype.itemsize > 4:
-        # Nothing downstream is finer; what is too large for it becomes infinite, and that is looked for.
-        with np.errstate(over="ignore"):
-            return array.astype(np.float32)
-    if array.dtype.byteorder == ">":
-        return array.astype(array.dtype.newbyteorder("="))
-    return np.ascontiguousarray(array)
+def _pds3(data: bytes, header: Keywords, pointer: Pointer | None, name: str) -> Image:
+    if pointer is None:
+        raise ImageError(StatusReason.IMAGE_UNREADABLE, f"{name}: its label points to no image")
+    pixels = pds3_pixels(data, header, pointer.offset, name)
+    scale, offset = header.get("IMAGE.SCALING_FACTOR", 1.0), header.get("IMAGE.OFFSET", 0.0)
+    constants = [header[key] for key in _MISSING_KEYS if key in header]
+    special = special_pixels(pixels, [float(value) for value in constants if isinstance(value, int | float)])
+    return scaled(
+        pixels, float(scale) if isinstance(scale, int | float) else 1.0,
+        float(offset) if isinstance(offset, int | float) else 0.0, special,
+    )  # fmt: skip
+
+
+def _vicar_label(data: bytes) -> Keywords:
+    """A VICAR file's label, with the part behind its pixels (EOL) where it has one."""
+    size = data[8:40].split()[0]
+    length = int(size) if size.isdigit() else 0
+    label = parse_vicar(data[:length].decode("latin-1"))
+    figures = [label.get(key) for key in ("RECSIZE", "NLB", "N2", "N3")]
+    if label.get("EOL") == 1 and all(isinstance(f, int) for f in figures):
+        record, header, rows, bands = (int(f or 0) for f in figures)
+        rest = data[length + record * (header + rows * bands) :]
+        if rest.startswith(b"LBLSIZE="):
+            more = rest[8:40].split()[0]
+            label = label | {
+                key: value
+                for key, value in parse_vicar(rest[: int(more) if more.isdigit() else 0].decode("latin-1")).items()
+                if key not in label
+            }
+    return label

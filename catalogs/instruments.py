@@ -1,6 +1,7 @@
-"""Schema of the camera blocks in ``catalogs/config/config_4N0_inst_*.yaml``."""
+"""Schema of the camera blocks in ``catalogs/config/config_4N0_inst_*.yaml``, and whose label is whose."""
 
 import re
+from collections.abc import Mapping
 from typing import Annotated, Literal
 
 import numpy as np
@@ -9,6 +10,8 @@ from pydantic import AfterValidator, Field
 from pipeline.options import InstrumentSettings, Options
 from pipeline.records import CameraModel, Detector, FloatArray
 
+CardValue = str | int | float | bool
+Header = Mapping[str, CardValue]
 Pair = tuple[float, float]
 Triple = tuple[float, float, float]
 # Matrices are written with a handful of digits; a wrong sign is off by more.
@@ -37,6 +40,11 @@ def _regular_expression(text: str) -> str:
     return text
 
 
+Pattern = Annotated[str, Field(min_length=1), AfterValidator(_regular_expression)]
+# Keywords of a label, each with a regular expression that its whole value must match, in either case.
+Marks = dict[str, Pattern]
+
+
 class SpiceNames(Options):
     """What SPICE calls a camera, and how its frame lies in it."""
 
@@ -57,6 +65,9 @@ class SpiceNames(Options):
 class CameraMode(Options):
     """One read-out mode of a camera: array, optics and detector."""
 
+    identify: Marks = Field(
+        default_factory=dict, description="label keywords that tell this mode from others of the same array"
+    )
     shape_vu: tuple[Annotated[int, Field(ge=16, le=16384)], Annotated[int, Field(ge=16, le=16384)]]
     focal_length_mm: float = Field(gt=0)
     k_px_per_mm: Annotated[tuple[Pair, Pair], AfterValidator(_invertible)] = Field(
@@ -96,10 +107,76 @@ class InstrumentBlock(InstrumentSettings):
     mission: str
     camera: str
     header: Literal["lorri"] | None = Field(None, description="reader of pointing cards in the product's own label")
-    identify: dict[str, str] = Field(default_factory=dict, description="header cards that mark this camera's products")
-    product_id_pattern: Annotated[str, AfterValidator(_regular_expression)] | None = Field(
+    identify: Marks | list[Marks] = Field(
+        default_factory=list, description="label keywords that mark this camera's products; a list holds alternatives"
+    )
+    product_id_pattern: Pattern | None = Field(
         None, description="regular expression of a file stem that is a product id"
     )
     spice: SpiceNames | None = Field(None, description="names for the spice provider; without them it cannot be used")
     quality_extension: str | None = Field(None, description="name of the extension whose non-zero pixels are bad")
     modes: dict[str, CameraMode] = Field(min_length=1, description="read-out modes by name")
+
+
+def matches(marks: Mapping[str, str], header: Header) -> bool:
+    """Whether a label carries all of some marks; without marks, no.
+
+    Parameters
+    ----------
+    marks
+        Regular expression by keyword.
+    header
+        Keywords of a label.
+
+    Returns
+    -------
+    bool
+        True if every expression matches its keyword's whole value.
+    """
+    return bool(marks) and all(
+        re.fullmatch(pattern, str(header.get(key, "")).strip(), re.IGNORECASE) for key, pattern in marks.items()
+    )
+
+
+def identify(header: Header, blocks: Mapping[str, InstrumentBlock]) -> InstrumentBlock | None:
+    """Camera whose identifying keywords a label carries.
+
+    Parameters
+    ----------
+    header
+        Keywords of a label, or columns of an index.
+    blocks
+        Configured cameras.
+
+    Returns
+    -------
+    InstrumentBlock or None
+        None where no camera claims the label.
+    """
+    for block in blocks.values():
+        alternatives = block.identify if isinstance(block.identify, list) else [block.identify]
+        if any(matches(marks, header) for marks in alternatives):
+            return block
+    return None
+
+
+def mode_of(block: InstrumentBlock, shape_vu: tuple[int, ...], header: Header) -> str | None:
+    """Name of the read-out mode of an image.
+
+    Parameters
+    ----------
+    block
+        Camera.
+    shape_vu
+        Of the stored array.
+    header
+        Keywords of its label, which decide where modes share a shape.
+
+    Returns
+    -------
+    str or None
+        The mode whose marks the label carries, else the first of this shape; None where no mode has the shape.
+    """
+    names = [name for name, mode in block.modes.items() if mode.shape_vu == shape_vu]
+    marked = (name for name in names if matches(block.modes[name].identify, header))
+    return next(marked, names[0] if names else None)
