@@ -7,8 +7,8 @@ import numpy as np
 from pydantic import ValidationError
 
 from catalogs.geometry import first_problem, plausible, settings_of
-from catalogs.images import CardValue, RawImage
-from catalogs.instruments import CameraMode, InstrumentBlock
+from catalogs.images import RawImage
+from catalogs.instruments import CameraMode, CardValue, InstrumentBlock
 from pipeline.errors import ContractError, GeometryError
 from pipeline.geometry.rotations import matrix_from_quaternion
 from pipeline.records import Attitude, Detector, FloatArray, Spacecraft, State

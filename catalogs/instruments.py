@@ -110,6 +110,10 @@ class InstrumentBlock(InstrumentSettings):
     identify: Marks | list[Marks] = Field(
         default_factory=list, description="label keywords that mark this camera's products; a list holds alternatives"
     )
+    image_time: Literal["start", "middle", "end"] = Field(
+        "start", description="part of the exposure that IMAGE_TIME stands for in this camera's labels"
+    )
+    exposure_unit: Literal["s", "ms"] = Field("ms", description="of exposures in labels that name no unit")
     product_id_pattern: Pattern | None = Field(
         None, description="regular expression of a file stem that is a product id"
     )

@@ -37,8 +37,8 @@ OUTSIDE_OF_SCIENCE = {
 }  # fmt: skip
 # Schemas are Arrow's, which is not a file.
 ORDER_OF_CATALOGS = (
-    "instruments", "images", "bodies", "shapes", "geometry", "header", "sidecar", "archive", "spice", "star_sources",
-    "stars",
+    "instruments", "label_text", "raw_images", "fits_images", "pds3_images", "gdal_images", "images", "labels",
+    "bodies", "shapes", "geometry", "header", "sidecar", "index_tables", "archive", "spice", "star_sources", "stars",
 )  # fmt: skip
 
 
