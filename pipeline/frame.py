@@ -9,6 +9,7 @@ from pydantic import Field
 from pipeline.errors import ImageError
 from pipeline.imaging.background import Background, BackgroundOptions, estimate_background, estimate_gain
 from pipeline.imaging.masks import missing_pixels, saturated_pixels
+from pipeline.imaging.noise import PixelNoise, pixel_noise
 from pipeline.imaging.psf import PointSpread
 from pipeline.options import Options
 from pipeline.records import BoolArray, CameraModel, Detector, FloatArray, Image, State
@@ -56,6 +57,10 @@ class Frame:
         (rows, cols) float32 DN, background subtracted; zero where bad.
     sigma
         (rows, cols) background noise, DN.
+    raw
+        (rows, cols) float32 DN as read, for light that fills a background's tiles; zero where not finite.
+    noise
+        Noise of a raw pixel by its level.
     bad
         (rows, cols) True where no measurement exists (missing, flagged or saturated).
     saturated
@@ -72,6 +77,8 @@ class Frame:
 
     pixels: Image
     sigma: Image
+    raw: Image
+    noise: PixelNoise
     bad: BoolArray
     saturated: BoolArray
     gain_e_per_dn: float | None
@@ -122,16 +129,26 @@ def make_frame(pixels: Image, flagged: BoolArray | None, state: State, options: 
     unusable = missing if flagged is None else missing | flagged
     bad = unusable | saturated
     background, gain = _level(image, bad, detector, floor, options)
+    raw = image
     image = image - background.level
     image[unusable & ~saturated] = 0.0
     noise = float(np.median(background.tile_sigma))
     image_class = _classify(background, replace(detector, gain_e_per_dn=gain), noise, floor, options)
     return Frame(
-        pixels=image, sigma=background.sigma, bad=bad, saturated=saturated, gain_e_per_dn=gain,
+        pixels=image, sigma=background.sigma, raw=raw,
+        noise=pixel_noise(raw, bad, _read_noise(detector, integral), detector.gain_e_per_dn, detector.bias_dn),
+        bad=bad, saturated=saturated, gain_e_per_dn=gain,
         spread=point_spread(state, options), image_class=image_class,
         background_dn=float(np.median(background.tile_level)), noise_dn=noise,
         missing_share=_share(missing), saturated_share=_share(saturated),
     )  # fmt: skip
+
+
+def _read_noise(detector: Detector, integral: bool) -> float | None:
+    """Declared noise without light, with the rounding to whole numbers; None where nobody declares it."""
+    if detector.read_noise_dn is None:
+        return None
+    return float(np.hypot(detector.read_noise_dn, _QUANTISATION_SIGMA if integral else 0.0))
 
 
 def _share(flags: BoolArray) -> float:

@@ -1,0 +1,372 @@
+"""Rendering of lit bodies onto a pixel grid, blurred by the point spread: templates with their exact derivatives.
+
+Cells (whole pixels, or a fraction of one) hold the mean radiance of the surface under them; where a limb crosses a
+cell it is sampled more finely. A discrete Gaussian then stands for the optics and the mean over a pixel's cells for the
+detector. Derivatives with respect to a shift are taken by the Gaussian's derivative, not by differences of pixels, which
+would flatten a sharp limb by a third.
+"""
+
+from dataclasses import dataclass
+from math import ceil, sqrt
+
+import cv2
+import numba
+import numpy as np
+
+from pipeline.camera import unproject
+from pipeline.imaging.illumination import reflectance
+from pipeline.records import CameraModel, FloatArray, Image, Record
+
+# Pixels between the rays that are computed exactly; between them distortion is bilinear to 1e-4 px.
+RAY_SPACING_PX = 16
+# Samples along each side of a cell that the limb crosses.
+_LIMB_SAMPLES = 5
+# Below this core, in cells, a sampled Gaussian no longer stands for a continuous one (error 0.3 % at 0.54).
+_LEAST_SIGMA_CELLS = 0.5
+
+
+@dataclass(frozen=True)
+class Window:
+    """Rectangle of whole pixels: its first row and column (may lie outside the array), rows and columns."""
+
+    v0: int
+    u0: int
+    rows: int
+    cols: int
+
+    def slices_in(self, other: "Window") -> tuple[slice, slice]:
+        """Rows and columns of this window inside an array that covers another one, clipped to it."""
+        top, left = max(self.v0 - other.v0, 0), max(self.u0 - other.u0, 0)
+        bottom = min(self.v0 + self.rows - other.v0, other.rows)
+        right = min(self.u0 + self.cols - other.u0, other.cols)
+        return slice(top, max(bottom, top)), slice(left, max(right, left))
+
+    def intersection(self, other: "Window") -> "Window":
+        """Common part, empty (zero rows or columns) where there is none."""
+        top, left = max(self.v0, other.v0), max(self.u0, other.u0)
+        bottom = min(self.v0 + self.rows, other.v0 + other.rows)
+        right = min(self.u0 + self.cols, other.u0 + other.cols)
+        return Window(top, left, max(bottom - top, 0), max(right - left, 0))
+
+    def grown(self, by_v: int, by_u: int) -> "Window":
+        """Wider by so many pixels on each side."""
+        return Window(self.v0 - by_v, self.u0 - by_u, self.rows + 2 * by_v, self.cols + 2 * by_u)
+
+    @property
+    def pixels(self) -> int:
+        """Area."""
+        return self.rows * self.cols
+
+
+@dataclass(frozen=True, eq=False)
+class RayGrid(Record):
+    """Rays (x/z, y/z) at every sixteenth pixel of a window, one more on each side than it needs.
+
+    Attributes
+    ----------
+    window
+        Pixels that it serves.
+    slopes
+        (grid rows, grid cols, 2); not-a-number where the camera model has no inverse.
+    """
+
+    window: Window
+    slopes: FloatArray
+
+    def __post_init__(self) -> None:
+        self._freeze(slopes=(None, None, 2))
+
+
+def ray_grid(camera: CameraModel, window: Window) -> RayGrid:
+    """Rays through a window's pixels.
+
+    Parameters
+    ----------
+    camera
+        Model.
+    window
+        Pixels, also outside the array.
+
+    Returns
+    -------
+    RayGrid
+        For :func:`render_cells`.
+    """
+    v = window.v0 - RAY_SPACING_PX + RAY_SPACING_PX * np.arange(window.rows // RAY_SPACING_PX + 4)
+    u = window.u0 - RAY_SPACING_PX + RAY_SPACING_PX * np.arange(window.cols // RAY_SPACING_PX + 4)
+    pixels = np.stack(np.meshgrid(v, u, indexing="ij"), axis=2).reshape(-1, 2).astype(float)
+    if camera.distortion_eps.any() or camera.k_xy_px_per_mm2.any():
+        rays, ok = unproject(camera, pixels)
+        slopes = np.where(ok[:, None], rays[:, :2] / rays[:, 2:], np.nan)
+    else:
+        photo = (pixels - camera.principal_point_vu)[:, ::-1] @ np.linalg.inv(camera.k_px_per_mm).T
+        slopes = photo / camera.focal_length_mm
+    return RayGrid(window, slopes.reshape(len(v), len(u), 2))
+
+
+@dataclass(frozen=True, eq=False)
+class Solid(Record):
+    """A body ready for rendering, in the camera frame.
+
+    Attributes
+    ----------
+    centre_km
+        (3,) from the camera.
+    form
+        (3, 3) B with ``x B x = 1`` on the surface, x from the centre, per km^2.
+    sun
+        (3,) unit vector toward the Sun.
+    law, parameter
+        Scattering law, see ``illumination.law_of``.
+    brightness
+        Factor on its radiance, relative to the other bodies.
+    shadowed_by
+        (m, 12) centre and rows of the form of bodies that may stand between it and the Sun.
+    """
+
+    centre_km: FloatArray
+    form: FloatArray
+    sun: FloatArray
+    law: int
+    parameter: float
+    brightness: float
+    shadowed_by: FloatArray
+
+    def __post_init__(self) -> None:
+        self._freeze(centre_km=(3,), form=(3, 3), sun=(3,), shadowed_by=(None, 12))
+
+
+@numba.njit(cache=True, nogil=True)
+def _in_shadow(px, py, pz, sun, occluders):  # type: ignore[no-untyped-def]
+    for k in range(occluders.shape[0]):
+        o = occluders[k]
+        ex, ey, ez = px - o[0], py - o[1], pz - o[2]
+        bsx = o[3] * sun[0] + o[4] * sun[1] + o[5] * sun[2]
+        bsy = o[6] * sun[0] + o[7] * sun[1] + o[8] * sun[2]
+        bsz = o[9] * sun[0] + o[10] * sun[1] + o[11] * sun[2]
+        a = sun[0] * bsx + sun[1] * bsy + sun[2] * bsz
+        b = ex * bsx + ey * bsy + ez * bsz
+        if b >= 0.0:
+            continue
+        bex = o[3] * ex + o[4] * ey + o[5] * ez
+        bey = o[6] * ex + o[7] * ey + o[8] * ez
+        bez = o[9] * ex + o[10] * ey + o[11] * ez
+        if b * b - a * (ex * bex + ey * bey + ez * bez - 1.0) > 0.0:
+            return True
+    return False
+
+
+@numba.njit(cache=True, nogil=True)
+def _draw(cells, slopes, origin, over, inner, centre, form, sun, law, parameter, brightness, occluders):  # type: ignore[no-untyped-def]
+    """Add one solid to the cells, in front of what they hold.
+
+    The ray is written d = centre/z + e: then ``disc = cBc/z^2 + 2 e.Bc/z + (e.Bc)^2 - (cBc - 1) eBe`` has no
+    difference of large numbers, however far the body is.
+    """
+    bc = form @ centre
+    cbc = centre @ bc
+    cz = centre[2]
+    cx, cy = centre[0] / cz, centre[1] / cz
+    rows, cols = cells.shape
+    size = 1.0 / over
+    for i in range(rows):
+        v_cell = (i + 0.5) * size - 0.5
+        for j in range(cols):
+            u_cell = (j + 0.5) * size - 0.5
+            gv = (v_cell + origin) / RAY_SPACING_PX
+            gu = (u_cell + origin) / RAY_SPACING_PX
+            a, b = int(gv), int(gu)
+            fv, fu = gv - a, gu - b
+            x00, x01, x10, x11 = slopes[a, b, 0], slopes[a, b + 1, 0], slopes[a + 1, b, 0], slopes[a + 1, b + 1, 0]
+            y00, y01, y10, y11 = slopes[a, b, 1], slopes[a, b + 1, 1], slopes[a + 1, b, 1], slopes[a + 1, b + 1, 1]
+            # Slopes are linear inside a patch: value and derivatives per pixel.
+            xv = ((x10 - x00) * (1 - fu) + (x11 - x01) * fu) / RAY_SPACING_PX
+            xu = ((x01 - x00) * (1 - fv) + (x11 - x10) * fv) / RAY_SPACING_PX
+            yv = ((y10 - y00) * (1 - fu) + (y11 - y01) * fu) / RAY_SPACING_PX
+            yu = ((y01 - y00) * (1 - fv) + (y11 - y10) * fv) / RAY_SPACING_PX
+            x = (x00 * (1 - fu) + x01 * fu) * (1 - fv) + (x10 * (1 - fu) + x11 * fu) * fv - cx
+            y = (y00 * (1 - fu) + y01 * fu) * (1 - fv) + (y10 * (1 - fu) + y11 * fu) * fv - cy
+            if not (x == x and y == y):
+                continue
+            ebc = x * bc[0] + y * bc[1]
+            bex, bey = form[0, 0] * x + form[0, 1] * y, form[1, 0] * x + form[1, 1] * y
+            disc = cbc / (cz * cz) + 2.0 * ebc / cz + ebc * ebc - (cbc - 1.0) * (x * bex + y * bey)
+            dx = 2.0 * (bc[0] / cz + ebc * bc[0] - (cbc - 1.0) * bex)
+            dy = 2.0 * (bc[1] / cz + ebc * bc[1] - (cbc - 1.0) * bey)
+            slope = abs(dx * xv + dy * yv) + abs(dx * xu + dy * yu)
+            # The cell's corner is half a cell from its centre along each axis; curvature is granted as much again.
+            if disc < -1.1 * size * slope:
+                continue
+            samples = inner if disc > 1.1 * size * slope else _LIMB_SAMPLES
+            light, covered = 0.0, 0
+            for p in range(samples):
+                ov = ((p + 0.5) / samples - 0.5) * size
+                for q in range(samples):
+                    ou = ((q + 0.5) / samples - 0.5) * size
+                    ex, ey = x + xv * ov + xu * ou, y + yv * ov + yu * ou
+                    ebc = ex * bc[0] + ey * bc[1]
+                    bex = form[0, 0] * ex + form[0, 1] * ey
+                    bey = form[1, 0] * ex + form[1, 1] * ey
+                    disc_here = cbc / (cz * cz) + 2.0 * ebc / cz + ebc * ebc - (cbc - 1.0) * (ex * bex + ey * bey)
+                    if disc_here < 0.0:
+                        continue
+                    covered += 1
+                    bez = form[2, 0] * ex + form[2, 1] * ey
+                    dbd = cbc / (cz * cz) + 2.0 * ebc / cz + ex * bex + ey * bey
+                    t = (cbc / cz + ebc - sqrt(disc_here)) / dbd
+                    # Normal B (t d - c) with d = c/z + e.
+                    f = t / cz - 1.0
+                    nx, ny, nz = f * bc[0] + t * bex, f * bc[1] + t * bey, f * bc[2] + t * bez
+                    norm = 1.0 / sqrt(nx * nx + ny * ny + nz * nz)
+                    mu0 = (nx * sun[0] + ny * sun[1] + nz * sun[2]) * norm
+                    if mu0 <= 0.0:
+                        continue
+                    rx, ry = cx + ex, cy + ey
+                    mu = -(nx * rx + ny * ry + nz) * norm / sqrt(rx * rx + ry * ry + 1.0)
+                    if occluders.shape[0] and _in_shadow(t * rx, t * ry, t, sun, occluders):
+                        continue
+                    light += reflectance(law, parameter, mu0, mu)
+            if covered:
+                total = samples * samples
+                cells[i, j] = brightness * light / total + (1.0 - covered / total) * cells[i, j]
+
+
+def cells_per_pixel(sigma_px: float, diameter_px: float) -> int:
+    """How finely to draw: twice as fine for a sharp core or a small body, whose few limb pixels do not average out.
+
+    Parameters
+    ----------
+    sigma_px
+        Core of the point spread.
+    diameter_px
+        Largest body.
+
+    Returns
+    -------
+    int
+        Cells along a pixel's side.
+    """
+    need = ceil(_LEAST_SIGMA_CELLS / sigma_px)
+    return max(need, 2 if diameter_px < 500.0 else 1)
+
+
+def render_cells(
+    cells: Image, solids: list[Solid], rays: RayGrid, window: Window, over: int, boxes: list[Window], inner: int = 1
+) -> None:
+    """Draw bodies over what the cells of a window hold, before any blur.
+
+    Parameters
+    ----------
+    cells
+        (rows * over, cols * over) float32, changed in place.
+    solids
+        Bodies, farthest first: nearer ones hide what is behind them.
+    rays
+        Of a window that holds this one.
+    window
+        Pixels of the cells.
+    over
+        Cells along a pixel's side.
+    boxes
+        Pixels that each body can touch.
+    inner
+        Samples along a side of a cell that no limb crosses.
+    """
+    for solid, box in zip(solids, boxes, strict=True):
+        part = box.intersection(window)
+        if not part.pixels:
+            continue
+        rows, cols = part.slices_in(window)
+        view = cells[rows.start * over : rows.stop * over, cols.start * over : cols.stop * over]
+        _draw(
+            view, _grid_for(rays, part), float(RAY_SPACING_PX), over, inner, solid.centre_km, solid.form, solid.sun,
+            solid.law, solid.parameter, solid.brightness, solid.shadowed_by,
+        )  # fmt: skip
+
+
+def _grid_for(rays: RayGrid, part: Window) -> FloatArray:
+    """Slopes re-sampled so that the grid starts one spacing before the part; linear, hence exact for a pinhole."""
+    dv, du = part.v0 - rays.window.v0, part.u0 - rays.window.u0
+    if dv % RAY_SPACING_PX == 0 and du % RAY_SPACING_PX == 0:
+        return rays.slopes[dv // RAY_SPACING_PX :, du // RAY_SPACING_PX :]
+    a, fv = divmod(dv / RAY_SPACING_PX, 1.0)
+    b, fu = divmod(du / RAY_SPACING_PX, 1.0)
+    grid = rays.slopes[int(a) :, int(b) :]
+    rows = grid[:-1] * (1.0 - fv) + grid[1:] * fv if fv else grid
+    return np.ascontiguousarray(rows[:, :-1] * (1.0 - fu) + rows[:, 1:] * fu if fu else rows)
+
+
+@dataclass(frozen=True, eq=False)
+class Template:
+    """Predicted image and its derivatives.
+
+    Attributes
+    ----------
+    window
+        Pixels that it covers.
+    image
+        (rows, cols) float32, brightness 1 for a surface lit and seen from straight above.
+    along_v, along_u
+        (rows, cols) float32, derivative of ``image`` with respect to v and u, per pixel.
+    """
+
+    window: Window
+    image: Image
+    along_v: Image
+    along_u: Image
+
+
+def gaussian_kernels(sigma: float) -> tuple[FloatArray, FloatArray]:
+    """Sampled Gaussian and its derivative, for correlation (as OpenCV filters).
+
+    Parameters
+    ----------
+    sigma
+        Cells.
+
+    Returns
+    -------
+    tuple
+        Kernel of unit sum; derivative kernel, exact for a linear ramp.
+    """
+    reach = max(1, ceil(4.0 * sigma))
+    x = np.arange(-reach, reach + 1, dtype=float)
+    smooth = np.exp(-0.5 * (x / sigma) ** 2)
+    smooth /= smooth.sum()
+    slope = x * smooth
+    slope /= (slope * x).sum()
+    return smooth, slope
+
+
+def blur(cells: Image, window: Window, sigma_px: float, over: int, with_slopes: bool = True) -> Template:
+    """Optics and detector: cells to a template.
+
+    Parameters
+    ----------
+    cells
+        (rows * over, cols * over).
+    window
+        Their pixels.
+    sigma_px
+        Gaussian core, before integration over the pixel.
+    over
+        Cells along a pixel's side.
+    with_slopes
+        Whether derivatives are wanted; else they stand as the image itself.
+
+    Returns
+    -------
+    Template
+        Over the same window; within four sigmas of its border the light from outside is missing.
+    """
+    smooth, slope = gaussian_kernels(sigma_px * over)
+    size = (window.cols, window.rows)
+    planes = []
+    kernels = ((smooth, smooth), (slope, smooth), (smooth, slope))
+    for kernel_v, kernel_u in kernels if with_slopes else kernels[:1]:
+        plane = cv2.sepFilter2D(cells, cv2.CV_32F, kernel_u, kernel_v, borderType=cv2.BORDER_REPLICATE)
+        planes.append(plane if over == 1 else cv2.resize(plane, size, interpolation=cv2.INTER_AREA))
+    if not with_slopes:
+        return Template(window, planes[0], planes[0], planes[0])
+    image, along_v, along_u = planes
+    return Template(window, image, along_v * np.float32(over), along_u * np.float32(over))

@@ -1,0 +1,414 @@
+"""Planets and moons: what of them the camera should see, their limbs and terminators, and their rendered image.
+
+A body that cannot be used says why: its :class:`BodyFate` stands in the record. Rendering is repeated under corrected
+attitudes; :class:`BodyScene` keeps the few templates that techniques share.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from pydantic import Field
+
+from pipeline.camera import project
+from pipeline.geometry.ellipsoid import limb_points
+from pipeline.geometry.pointing import corrected_attitude
+from pipeline.imaging.illumination import law_of
+from pipeline.imaging.mesh import MeshSolid, render_meshes
+from pipeline.imaging.render import (
+    RayGrid,
+    Solid,
+    Template,
+    Window,
+    blur,
+    cells_per_pixel,
+    ray_grid,
+    render_cells,
+)
+from pipeline.options import Options
+from pipeline.records import Body, CameraModel, FloatArray, State
+
+_LIMB_SAMPLES = 96
+# Pixels of sky that a template keeps around a body, beyond the reach of the point spread.
+_SKY_PX = 6
+# Sky around everything that a search may look at.
+_CANVAS_SKY_PX = 24
+# Templates are drawn at offsets on this grid (pixels, and pixels at half the array's diagonal for a rotation), so that
+# techniques that agree share one; what is left is small enough for a linear model.
+QUANTUM_PX = 0.125
+
+
+class BodyPredictionOptions(Options):
+    """Which bodies are worth predicting."""
+
+    min_diameter_px: float = Field(3.0, ge=1, le=100, description="apparent diameter below which a body is a point")
+    min_lit_px: float = Field(0.3, gt=0, le=100, description="width of the lit part below which a body is dark")
+
+
+@dataclass(frozen=True)
+class BodyFate:
+    """One body of the State and why it is not used; ``reason`` is empty where it is.
+
+    Attributes
+    ----------
+    name
+        Body.
+    centre_vu
+        Predicted pixel of its centre, None behind the camera.
+    diameter_px, phase_deg
+        Apparent size (geometric mean of the outline's axes) and phase angle.
+    reason
+        Empty, ``behind_camera``, ``outside_field``, ``too_small``, ``unlit`` or ``around_camera``.
+    """
+
+    name: str
+    centre_vu: tuple[float, float] | None
+    diameter_px: float
+    phase_deg: float
+    reason: str
+
+
+@dataclass(frozen=True, eq=False)
+class BodyView:
+    """A body in the camera frame of one attitude.
+
+    Attributes
+    ----------
+    body
+        The record.
+    centre_km
+        (3,) camera frame.
+    camera_from_body
+        (3, 3).
+    sun
+        (3,) camera frame.
+    centre_vu
+        (2,) pixel of the centre.
+    box
+        Pixels that it can touch.
+    diameter_px, phase_rad, px_per_km
+        Size; phase; scale at the body's distance.
+    """
+
+    body: Body
+    centre_km: FloatArray
+    camera_from_body: FloatArray
+    sun: FloatArray
+    centre_vu: FloatArray
+    box: Window
+    diameter_px: float
+    phase_rad: float
+    px_per_km: float
+
+    @property
+    def observer_km(self) -> FloatArray:
+        """(3,) the camera from the body's centre, body-fixed."""
+        return np.asarray(-self.camera_from_body.T @ self.centre_km)
+
+    @property
+    def sun_from_body(self) -> FloatArray:
+        """(3,) unit vector toward the Sun, body-fixed."""
+        return np.asarray(self.camera_from_body.T @ self.sun)
+
+    @property
+    def lit_px(self) -> float:
+        """Widest extent of the lit part across the terminator."""
+        return float(self.diameter_px * (1.0 + np.cos(self.phase_rad)) / 2.0)
+
+
+def view_body(body: Body, camera: CameraModel, camera_from_j2000: FloatArray) -> BodyView | str:
+    """Place a body in the camera frame.
+
+    Parameters
+    ----------
+    body
+        Body.
+    camera
+        Model.
+    camera_from_j2000
+        (3, 3) attitude.
+
+    Returns
+    -------
+    BodyView or str
+        Or the reason why there is none.
+    """
+    centre = camera_from_j2000 @ body.position_km
+    rotation = camera_from_j2000 @ body.body_from_j2000.T
+    distance = float(np.linalg.norm(centre))
+    observer = -rotation.T @ centre
+    if np.linalg.norm(observer / body.radii_km) <= 1.0:
+        return "around_camera"
+    if centre[2] <= 0 and distance > 2.0 * body.radii_km.max():
+        return "behind_camera"
+    sun = camera_from_j2000 @ body.sun_direction_j2000
+    phase = float(np.arccos(np.clip(-centre @ sun / distance, -1.0, 1.0)))
+    outline = limb_points(body.radii_km, observer, np.linspace(0, 2 * np.pi, _LIMB_SAMPLES, endpoint=False))
+    pixels, ahead = project(camera, outline @ rotation.T + centre)
+    middle = project(camera, centre[None])[0][0]
+    if not ahead.any() or not np.isfinite(middle).all():
+        return "behind_camera"
+    scale = float(camera.focal_length_mm * np.sqrt(abs(np.linalg.det(camera.k_px_per_mm))) / distance)
+    diameter = 2.0 * float(np.cbrt(np.prod(body.radii_km))) * scale
+    seen = pixels[ahead]
+    low, high = np.floor(seen.min(axis=0)) - 1, np.ceil(seen.max(axis=0)) + 2
+    if not ahead.all():
+        low, high = np.full(2, -1e6), np.full(2, 1e6)
+    low, high = np.clip(low, -1e6, 1e6), np.clip(high, -1e6, 1e6)
+    box = Window(int(low[0]), int(low[1]), int(high[0] - low[0]), int(high[1] - low[1]))
+    return BodyView(body, centre, rotation, sun, middle, box, diameter, phase, scale)
+
+
+@dataclass(frozen=True, eq=False)
+class BodyScene:
+    """All usable bodies of an image, and templates of them under any pointing.
+
+    Attributes
+    ----------
+    state
+        Geometry.
+    reach_vu
+        Farthest that a body can be from its prediction, whole pixels: the search margin and what a rotation adds.
+    sigma_px
+        Core of the point spread.
+    views
+        Under the a-priori attitude, farthest first.
+    fates
+        Every body of the State.
+    canvas
+        The array widened by the reach and some sky.
+    rays
+        Over the canvas, None without bodies.
+    """
+
+    state: State
+    reach_vu: tuple[int, int]
+    sigma_px: float
+    views: tuple[BodyView, ...]
+    fates: tuple[BodyFate, ...]
+    canvas: Window
+    rays: RayGrid | None
+    _templates: dict[tuple[int, int, int], tuple[tuple[BodyView, ...], Template]] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        return len(self.views)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Bodies in the scene."""
+        return tuple(view.body.name for view in self.views)
+
+    @property
+    def pivot_vu(self) -> FloatArray:
+        """(2,) centroid of the predicted centres (seed 000)."""
+        return np.asarray(np.mean([view.centre_vu for view in self.views], axis=0))
+
+    def attitude(self, offset_vu: FloatArray, rotation_rad: float) -> FloatArray:
+        """(3, 3) camera_from_j2000 for a correction at the array centre."""
+        prior = self.state.attitude.camera_from_j2000
+        return corrected_attitude(self.state.camera_model, prior, offset_vu, rotation_rad)
+
+    def quantised(self, offset_vu: FloatArray, rotation_rad: float) -> tuple[FloatArray, float]:
+        """Nearest pointing at which templates are drawn."""
+        step = QUANTUM_PX / (np.hypot(*self.state.camera_model.shape_vu) / 2)
+        offset = QUANTUM_PX * np.rint(np.asarray(offset_vu) / QUANTUM_PX)
+        return offset, float(step * np.rint(rotation_rad / step))
+
+    def template(self, offset_vu: FloatArray, rotation_rad: float) -> tuple[tuple[BodyView, ...], Template]:
+        """Bodies under a corrected pointing, in the array, blurred.
+
+        Parameters
+        ----------
+        offset_vu, rotation_rad
+            Correction at the array centre; drawn exactly there, see :meth:`quantised`.
+
+        Returns
+        -------
+        tuple
+            Views; template over those of the array's pixels that bodies (with some sky) can touch.
+        """
+        step = QUANTUM_PX / (np.hypot(*self.state.camera_model.shape_vu) / 2)
+        key = (round(offset_vu[0] / QUANTUM_PX), round(offset_vu[1] / QUANTUM_PX), round(rotation_rad / step))
+        if key not in self._templates:
+            views = self.views_at(self.attitude(offset_vu, rotation_rad))
+            rows, cols = self.state.camera_model.shape_vu
+            window = self.around(views, Window(0, 0, rows, cols))
+            self._templates[key] = views, self.render(views, window)
+        return self._templates[key]
+
+    def views_at(self, attitude: FloatArray) -> tuple[BodyView, ...]:
+        """The scene's bodies under another attitude."""
+        views = (view_body(view.body, self.state.camera_model, attitude) for view in self.views)
+        return tuple(view for view in views if isinstance(view, BodyView))
+
+    def around(self, views: tuple[BodyView, ...], limit: Window, sky_px: int | None = None) -> Window:
+        """Smallest window inside a limit that holds the bodies and some sky around them."""
+        sky = sky_px if sky_px is not None else _SKY_PX + int(np.ceil(4.0 * self.sigma_px))
+        boxes = [view.box.grown(sky, sky).intersection(limit) for view in views]
+        boxes = [box for box in boxes if box.pixels]
+        if not boxes:
+            return Window(limit.v0, limit.u0, 0, 0)
+        top, left = min(b.v0 for b in boxes), min(b.u0 for b in boxes)
+        bottom, right = max(b.v0 + b.rows for b in boxes), max(b.u0 + b.cols for b in boxes)
+        return Window(top, left, bottom - top, right - left)
+
+    def render(self, views: tuple[BodyView, ...], window: Window, coarse: bool = False) -> Template:
+        """Draw bodies into a window.
+
+        Parameters
+        ----------
+        views
+            Farthest first.
+        window
+            Pixels inside the canvas.
+        coarse
+            One cell a pixel, whatever the point spread: good enough to find a body by.
+
+        Returns
+        -------
+        Template
+            Blurred.
+        """
+        if not window.pixels or self.rays is None:
+            empty = np.zeros((window.rows, window.cols), np.float32)
+            return Template(window, empty, empty, empty)
+        largest = max(view.diameter_px for view in views)
+        over = 1 if coarse else cells_per_pixel(self.sigma_px, largest)
+        if any(view.body.mesh is not None for view in views):
+            over = 1 if coarse else max(over, 2)
+        inner = 1 if coarse or largest > 60.0 else 2
+        cells = np.zeros((window.rows * over, window.cols * over), np.float32)
+        for run, is_mesh in _runs(views):
+            if is_mesh:
+                meshes = [_mesh_solid(view, self.state.camera_model) for view in run]
+                render_meshes(cells, meshes, window, over)
+            else:
+                solids = [_solid(view, views) for view in run]
+                render_cells(cells, solids, self.rays, window, over, [view.box for view in run], inner)
+        # A coarse template is never sharper than its pixels can show.
+        return blur(cells, window, max(self.sigma_px, 0.5) if coarse else self.sigma_px, over, not coarse)
+
+
+def _runs(views: tuple[BodyView, ...]) -> list[tuple[list[BodyView], bool]]:
+    """Consecutive bodies of one kind, so that nearer ones are drawn over farther ones."""
+    runs: list[tuple[list[BodyView], bool]] = []
+    for view in views:
+        is_mesh = view.body.mesh is not None
+        if runs and runs[-1][1] == is_mesh:
+            runs[-1][0].append(view)
+        else:
+            runs.append(([view], is_mesh))
+    return runs
+
+
+def form_of(view: BodyView) -> FloatArray:
+    """(3, 3) B in the camera frame with ``x B x = 1`` on the surface.
+
+    Parameters
+    ----------
+    view
+        Body.
+
+    Returns
+    -------
+    numpy.ndarray
+        Per km^2.
+    """
+    rotation = view.camera_from_body
+    return np.asarray(rotation @ np.diag(1.0 / view.body.radii_km**2) @ rotation.T)
+
+
+def _solid(view: BodyView, others: tuple[BodyView, ...]) -> Solid:
+    law, parameter = law_of(view.body.photometry, view.body.photometry_parameter, view.phase_rad)
+    shading = [
+        np.concatenate([other.centre_km, form_of(other).ravel()])
+        for other in others
+        if other is not view and _may_shadow(other, view)
+    ]
+    occluders = np.array(shading).reshape(-1, 12)
+    return Solid(view.centre_km, form_of(view), view.sun, law, parameter, 1.0, occluders)
+
+
+def _may_shadow(near_sun: BodyView, view: BodyView) -> bool:
+    """Whether a body stands between another and the Sun, by their spheres."""
+    gap = near_sun.centre_km - view.centre_km
+    along = float(gap @ view.sun)
+    aside = float(np.linalg.norm(gap - along * view.sun))
+    return along > 0 and aside < near_sun.body.radii_km.max() + view.body.radii_km.max()
+
+
+def _mesh_solid(view: BodyView, camera: CameraModel) -> MeshSolid:
+    mesh = view.body.mesh
+    assert mesh is not None
+    law, parameter = law_of(view.body.photometry, view.body.photometry_parameter, view.phase_rad)
+    points = mesh.vertices_km @ view.camera_from_body.T + view.centre_km
+    pixels, _ = project(camera, points)
+    return MeshSolid(points, pixels, mesh.facets, view.sun, law, parameter)
+
+
+def predict_bodies(state: State, sigma_px: float, options: BodyPredictionOptions) -> BodyScene:
+    """Bodies in or near the field.
+
+    Parameters
+    ----------
+    state
+        Geometry.
+    sigma_px
+        Core of the point spread.
+    options
+        Limits.
+
+    Returns
+    -------
+    BodyScene
+        Possibly without any.
+    """
+    rows, cols = state.camera_model.shape_vu
+    reach = reach_px(state)
+    array = Window(0, 0, rows, cols)
+    canvas = array.grown(*reach)
+    views, fates = [], []
+    for body in state.bodies:
+        view = view_body(body, state.camera_model, state.attitude.camera_from_j2000)
+        reason = view if isinstance(view, str) else _cull(view, canvas, options)
+        fates.append(_fate(body, view, reason))
+        if isinstance(view, BodyView) and not reason:
+            views.append(view)
+    views.sort(key=lambda view: -float(np.linalg.norm(view.centre_km)))
+    canvas = canvas.grown(_CANVAS_SKY_PX, _CANVAS_SKY_PX)
+    rays = ray_grid(state.camera_model, canvas) if views else None
+    return BodyScene(state, reach, sigma_px, tuple(views), tuple(fates), canvas, rays)
+
+
+def reach_px(state: State) -> tuple[int, int]:
+    """Farthest that a body of the array can be from its prediction.
+
+    Parameters
+    ----------
+    state
+        Camera and settings.
+
+    Returns
+    -------
+    tuple of int
+        Pixels along v and u: the search margin, and the way that the largest rotation carries the array's corner.
+    """
+    settings = state.settings
+    turn = np.radians(settings.max_rotation_deg) if settings.fit_camera_rotation else 0.0
+    half_v, half_u = (n / 2 for n in state.camera_model.shape_vu)
+    margin_v, margin_u = settings.search_margin_vu
+    return int(np.ceil(margin_v + turn * half_u)), int(np.ceil(margin_u + turn * half_v))
+
+
+def _cull(view: BodyView, canvas: Window, options: BodyPredictionOptions) -> str:
+    if not view.box.intersection(canvas).pixels:
+        return "outside_field"
+    if view.diameter_px < options.min_diameter_px:
+        return "too_small"
+    return "unlit" if view.lit_px < options.min_lit_px else ""
+
+
+def _fate(body: Body, view: BodyView | str, reason: str) -> BodyFate:
+    if isinstance(view, str):
+        return BodyFate(body.name, None, 0.0, 0.0, reason)
+    centre = (float(view.centre_vu[0]), float(view.centre_vu[1]))
+    return BodyFate(body.name, centre, view.diameter_px, float(np.degrees(view.phase_rad)), reason)
