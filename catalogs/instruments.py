@@ -41,7 +41,8 @@ def _regular_expression(text: str) -> str:
 
 
 Pattern = Annotated[str, Field(min_length=1), AfterValidator(_regular_expression)]
-# Keywords of a label, each with a regular expression that its whole value must match, in either case.
+# Keywords of a label, each with a regular expression that its whole value must match, in either case; of keywords
+# joined by '|' any one may.
 Marks = dict[str, Pattern]
 
 
@@ -54,6 +55,9 @@ class SpiceNames(Options):
     camera_from_instrument: Annotated[tuple[Triple, Triple, Triple], AfterValidator(_rotation)] = Field(
         ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
         description="rotation from that frame to the camera frame (z out of the lens)",
+    )
+    ck_tolerance_s: float = Field(
+        0.0, ge=0, le=3600, description="how far the nearest pointing may be where C-kernels hold single ones, seconds"
     )
 
     def rotation(self) -> FloatArray:
@@ -138,7 +142,8 @@ def matches(marks: Mapping[str, str], header: Header) -> bool:
         True if every expression matches its keyword's whole value.
     """
     return bool(marks) and all(
-        re.fullmatch(pattern, str(header.get(key, "")).strip(), re.IGNORECASE) for key, pattern in marks.items()
+        any(re.fullmatch(pattern, str(header.get(key, "")).strip(), re.IGNORECASE) for key in keys.split("|"))
+        for keys, pattern in marks.items()
     )
 
 
