@@ -6,6 +6,8 @@ from typing import Annotated
 import typer
 
 from pipeline.errors import ConfigurationError
+from workflows.samples.flyby import make_flyby_sample
+from workflows.samples.flyby_options import FlybyOptions
 from workflows.samples.options import StarSampleOptions
 from workflows.samples.stars import make_star_sample
 
@@ -34,3 +36,28 @@ def stars(
     except (ValueError, OSError) as error:
         raise ConfigurationError(f"{directory}: {error}") from error
     typer.echo(f"{frames} images and truth.json in {path.parent}")
+
+
+@app.command()
+def flyby(
+    directory: Annotated[Path, typer.Argument(help="New or empty folder.")],
+    frames: Annotated[int, typer.Option(min=1, help="Images to make.")] = 24,
+    seed: Annotated[int, typer.Option(min=0, help="Same seed, same bytes.")] = 1,
+    largest: Annotated[float, typer.Option(min=6.0, max=10000.0, help="Largest diameter of a target, pixels.")] = 3000.0,
+    haze: Annotated[float, typer.Option(min=0.0, max=500.0, help="Scale height of the planet's air, km.")] = 0.0,
+    stars: Annotated[float, typer.Option(min=0.0, max=1.0, help="Share of images with stars.")] = 0.2,
+    traps: Annotated[bool, typer.Option("--traps", help="Only scenes of which something wrong is told.")] = False,
+    smooth: Annotated[bool, typer.Option("--smooth", help="Smooth grey ellipsoids.")] = False,
+    processes: Annotated[int, typer.Option(min=1, help="Processes that draw.")] = 2,
+) -> None:
+    """A planet and its moons before Cassini-, Voyager- and LORRI-like cameras, with SPICE kernels."""
+    default = FlybyOptions()
+    options = FlybyOptions(
+        frames=frames, seed=seed, processes=processes, diameter_px=(default.diameter_px[0], largest), haze_km=haze,
+        star_share=stars, trap_share=1.0 if traps else default.trap_share, smooth=smooth,
+    )  # fmt: skip
+    try:
+        path = make_flyby_sample(directory, options)
+    except (ValueError, OSError) as error:
+        raise ConfigurationError(f"{directory}: {error}") from error
+    typer.echo(f"{frames} images, kernels and truth.json in {path.parent}")
