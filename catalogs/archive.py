@@ -1,25 +1,21 @@
-"""An archive: its description, and the list of its images."""
+"""An archive: its description, and the bytes of its files."""
 
 import os
 import posixpath
-import re
 import zipfile
-from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import fsspec
 import yaml
 from fsspec.implementations.local import LocalFileSystem
 from fsspec.spec import AbstractFileSystem
-from fsspec.utils import glob_translate
 from pydantic import Field, ValidationError
 
 from catalogs.bodies import BodyBlock
 from catalogs.geometry import first_problem
-from catalogs.instruments import InstrumentBlock
-from catalogs.sidecar import sidecar_image_id
+from catalogs.selection import Selection
 from pipeline.errors import ConfigurationError
 from pipeline.options import Options
 
@@ -27,8 +23,6 @@ DESCRIPTION = "archive.yaml"
 SIDECAR_SUFFIX = ".geometry.json"
 STARS_SUFFIX = ".stars.parquet"
 _OVERRIDE = "--set archive."
-# File names may have 255 bytes on every common file system; ending and temporary mark take 39 of them.
-_LONGEST_ID = 200
 
 
 class StarTableRef(Options):
@@ -38,11 +32,20 @@ class StarTableRef(Options):
     place: Literal["mean", "apparent"] = Field("mean", description="catalogue place, or place as seen")
 
 
+class IndexRef(Options):
+    """Images by a table of the archive instead of by their names."""
+
+    index: str = Field(min_length=1, description="INDEX.TAB with its label beside it, or a PDS4 collection .csv")
+
+
 class ArchiveDescription(Options):
     """Content of ``archive.yaml``; the command line can say the same with ``--set archive.KEY=VALUE``."""
 
     name: str = "archive"
-    images: str | list[str] = Field(min_length=1, description="glob relative to the root, or a list of globs and paths")
+    images: Annotated[str, Field(min_length=1)] | Annotated[list[str], Field(min_length=1)] | IndexRef = Field(
+        description="glob relative to the root, a list of globs and paths, or an index table"
+    )
+    select: Selection = Field(default=Selection(), description="which of the images are wanted")
     geometry: Literal["auto", "header", "sidecar"] = Field("auto", description="auto: a sidecar where there is one")
     instrument: str | None = Field(None, description="a camera block; by default the header is recognised")
     stars: str | list[str | StarTableRef] = Field("per-image", description="built-in names, tables, or per-image")
@@ -64,11 +67,14 @@ class ImageRef:
         Relative to the archive's root, '/'-separated.
     exists
         False for a listed file that is not there.
+    companions
+        Paths of files that belong to it: its detached label.
     """
 
     image_id: str
     path: str
     exists: bool = True
+    companions: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -97,7 +103,19 @@ class Archive:
         return read_bytes(self.url, path)
 
 
-def _filesystem(url: str) -> tuple[AbstractFileSystem, str]:
+def filesystem(url: str) -> tuple[AbstractFileSystem, str]:
+    """File system of an archive, and its root in it without a slash at the end.
+
+    Parameters
+    ----------
+    url
+        Path or fsspec URL.
+
+    Returns
+    -------
+    tuple
+        As named.
+    """
     fs, root = fsspec.core.url_to_fs(url)
     return fs, root.rstrip("/")
 
@@ -105,8 +123,8 @@ def _filesystem(url: str) -> tuple[AbstractFileSystem, str]:
 def _locate(url: str, path: str) -> tuple[AbstractFileSystem, str]:
     """File system and full name of a file; joining URLs as text would break chained ones (``zip://::a.zip``)."""
     if "://" in path:
-        return _filesystem(path)
-    fs, root = _filesystem(url)
+        return filesystem(path)
+    fs, root = filesystem(url)
     return fs, f"{root}/{path}"
 
 
@@ -219,83 +237,18 @@ def _description_text(url: str, name: str) -> bytes | None:
 
 
 def _description(content: dict[object, object], overrides: Mapping[str, object], source: str) -> ArchiveDescription:
+    keys: dict[str, object] = {str(key): content[key] for key in content}
+    chosen, wanted = keys.get("select"), overrides.get("select")
+    if isinstance(chosen, dict) and isinstance(wanted, dict):
+        # A selection on the command line narrows, or replaces key by key, that of the file.
+        overrides = {**overrides, "select": {**chosen, **wanted}}
     try:
-        return ArchiveDescription.model_validate({**{str(key): content[key] for key in content}, **overrides})
+        return ArchiveDescription.model_validate({**keys, **overrides})
     except ValidationError as error:
         key = str(error.errors(include_url=False)[0]["loc"][0])
         source = f"{_OVERRIDE}{key}" if key in overrides else source
         allowed = ", ".join(ArchiveDescription.model_fields)
         raise ConfigurationError(f"{source}: {first_problem(error)} (keys: {allowed})") from error
-
-
-def list_images(archive: Archive, blocks: Mapping[str, InstrumentBlock]) -> list[ImageRef]:
-    """Images of an archive in the order of their ids.
-
-    Parameters
-    ----------
-    archive
-        The archive.
-    blocks
-        Camera blocks, which know what a product id looks like.
-
-    Returns
-    -------
-    list of ImageRef
-        Sorted by image id.
-
-    Raises
-    ------
-    ConfigurationError
-        If nothing matches, a name cannot be inside the archive, or two images share an id.
-    """
-    patterns = archive.description.images
-    patterns = [_inside(pattern) for pattern in ([patterns] if isinstance(patterns, str) else patterns)]
-    fs, root = _filesystem(archive.url)
-    # Some file systems list names with a leading slash below an empty root, some without.
-    files = _walk(root or "/", frozenset()) if isinstance(fs, LocalFileSystem) else fs.find(root)
-    every = sorted(path.removeprefix(root).lstrip("/") for path in files)
-    known = set(every)
-    found: dict[str, bool] = {}
-    for pattern in patterns:
-        if pattern in known or not any(c in pattern for c in "*?["):
-            found[pattern] = pattern in known
-        else:
-            matches = _matcher(pattern)
-            found.update({path: True for path in every if matches(path)})
-    if not found:
-        raise ConfigurationError(f"{archive.url}: no file matches images: {', '.join(patterns)}")
-    refs = [ImageRef(_image_id(path, archive, known, blocks), path, exists) for path, exists in found.items()]
-    _refuse_ids(refs)
-    return sorted(refs, key=lambda ref: ref.image_id)
-
-
-def _walk(folder: str, above: frozenset[str]) -> Iterator[str]:
-    """Files of a local folder; linked folders are entered, which fsspec does not do, but no circle is."""
-    real = os.path.realpath(folder)
-    if real in above:
-        return
-    with os.scandir(folder) as entries:
-        for entry in entries:
-            if entry.is_dir():
-                yield from _walk(entry.path, above | {real})
-            else:
-                yield entry.path
-
-
-def _inside(pattern: str) -> str:
-    """Pattern in its shortest form, refused where it cannot name files of the archive."""
-    short = posixpath.normpath(pattern)
-    if not pattern or "://" in pattern or short in (".", "..") or short.startswith(("/", "../")) or "\0" in pattern:
-        raise ConfigurationError(f"images: {pattern!r} is no path inside the archive")
-    return short
-
-
-def _matcher(pattern: str) -> Callable[[str], object]:
-    """Shell pattern where ``*`` stays inside a folder and ``**`` does not."""
-    try:
-        return re.compile(glob_translate(pattern)).match
-    except (ValueError, re.error) as error:
-        raise ConfigurationError(f"images: {pattern!r} is no pattern: {error}") from error
 
 
 def stem(path: str) -> str:
@@ -312,42 +265,3 @@ def stem(path: str) -> str:
         For example ``frames/a`` for ``frames/a.fits``.
     """
     return posixpath.splitext(path)[0]
-
-
-def _image_id(path: str, archive: Archive, known: set[str], blocks: Mapping[str, InstrumentBlock]) -> str:
-    """The sidecar's claim, else a product id that the file's name is, else the relative path."""
-    sidecar = stem(path) + SIDECAR_SUFFIX
-    if archive.description.geometry != "header" and sidecar in known:
-        claimed = _claimed_id(archive, sidecar)
-        if claimed is not None:
-            return _safe(claimed)
-    name = posixpath.basename(stem(path))
-    if any(b.product_id_pattern and re.fullmatch(b.product_id_pattern, name) for b in blocks.values()):
-        return _safe(name)
-    return _safe(stem(path))
-
-
-def _claimed_id(archive: Archive, sidecar: str) -> str | None:
-    try:
-        return sidecar_image_id(archive.read(sidecar))
-    except OSError:
-        # The image's own record will say that its sidecar cannot be read.
-        return None
-
-
-def _safe(text: str) -> str:
-    """Id that is a file name everywhere."""
-    return re.sub(r"[^\w.+=-]", "_", text.replace("/", "__"))
-
-
-def _refuse_ids(refs: Sequence[ImageRef]) -> None:
-    """Ids name files: they must be short enough, and differ."""
-    long = next((ref for ref in refs if len(ref.image_id.encode()) > _LONGEST_ID), None)
-    if long is not None:
-        raise ConfigurationError(f"{long.path}: its image id is longer than {_LONGEST_ID} bytes: {long.image_id}")
-    # Some file systems cannot tell ids apart that differ in case only.
-    counts = Counter(ref.image_id.lower() for ref in refs)
-    shared = [ref for ref in refs if counts[ref.image_id.lower()] > 1]
-    if shared:
-        a, b = sorted(shared, key=lambda ref: (ref.image_id.lower(), ref.path))[:2]
-        raise ConfigurationError(f"{a.path} and {b.path} share the image id {a.image_id}")

@@ -92,7 +92,7 @@ def first_problem(error: ValidationError) -> str:
 
 def _is_alternative(part: int | str) -> bool:
     """Whether a step of a problem's place is pydantic's name for one of several types."""
-    return isinstance(part, str) and (part in ("str", "StarTableRef") or "[" in part)
+    return isinstance(part, str) and (part in ("str", "constrained-str", "StarTableRef", "IndexRef") or "[" in part)
 
 
 def settings_of(block: InstrumentBlock | None, source: object, overrides: Mapping[str, object]) -> InstrumentSettings:

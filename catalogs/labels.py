@@ -7,12 +7,19 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import datetime, timedelta
+from typing import TYPE_CHECKING
 
 from catalogs.instruments import CardValue, Header, InstrumentBlock, identify, mode_of
 from catalogs.raw_images import RawImage
 
+if TYPE_CHECKING:
+    from pipeline.curate import Json
+
 Words = dict[str, CardValue]
 
+# Outside these a figure is damage, and sums of them overflow.
+_YEARS = (1900, 2200)
+_LONGEST_EXPOSURE_S = 1e6
 # What labels write where they do not know (PDS3 Standards Reference 17.2).
 _UNKNOWN = ("", "N/A", "UNK", "UNKNOWN", "NULL", "NONE", "---")
 _TIME = re.compile(
@@ -67,13 +74,13 @@ class Label:
     missing_lines: int | None = None
     anomalies: tuple[str, ...] = ()
 
-    def document(self) -> dict[str, CardValue | list[str] | None]:
+    def document(self) -> "dict[str, Json]":
         """As JSON values."""
         return {
             "product_id": self.product_id, "block": self.block, "mode": self.mode, "start_utc": self.start_utc,
-            "mid_utc": self.mid_utc, "exposure_s": self.exposure_s, "filters": list(self.filters),
+            "mid_utc": self.mid_utc, "exposure_s": self.exposure_s, "filters": [*self.filters],
             "target": self.target, "summation": self.summation, "missing_lines": self.missing_lines,
-            "anomalies": list(self.anomalies),
+            "anomalies": [*self.anomalies],
         }  # fmt: skip
 
 
@@ -245,9 +252,10 @@ def _text(words: Words, key: str) -> str | None:
 def _exposure(words: Words, block: InstrumentBlock | None) -> float | None:
     value = words.get("EXPOSURE_DURATION")
     unit = str(words.get("EXPOSURE_DURATION.unit", "" if block is None else block.exposure_unit)).lower()
-    if not isinstance(value, int | float) or isinstance(value, bool) or not value >= 0 or not unit:
+    if not isinstance(value, int | float) or isinstance(value, bool) or not unit:
         return None
-    return float(value) / 1000.0 if unit.startswith(("ms", "milli")) else float(value)
+    seconds = value / 1000.0 if unit.startswith(("ms", "milli")) else float(value)
+    return seconds if 0 <= seconds < _LONGEST_EXPOSURE_S else None
 
 
 def _times(
@@ -295,6 +303,8 @@ def utc_of(text: str) -> datetime | None:
     if match is None:
         return None
     year, month, day, of_year, hour, minute, second = match.groups()
+    if not _YEARS[0] <= int(year) <= _YEARS[1]:
+        return None
     try:
         date = datetime(int(year), int(month or 1), int(day or 1)) + timedelta(days=int(of_year or 1) - 1)
         # By hand: the sixtieth second of a leap becomes the next minute, which costs a second once in years.

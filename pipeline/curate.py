@@ -11,6 +11,7 @@ from pipeline.geometry.pointing import corrected_attitude
 from pipeline.geometry.rotations import quaternion_from_matrix
 from pipeline.navigate import Navigation, corrected_sigma_px
 from pipeline.options import Options
+from pipeline.predict.bodies import BodyFate
 from pipeline.records import FloatArray, State
 from pipeline.status import Rank, Status, StatusReason, status_of
 from pipeline.techniques.base import FeatureTable, TechniqueFailure, TechniqueResult, covariance_of
@@ -67,7 +68,9 @@ class Provenance:
     kernels: tuple[tuple[str, str], ...] = ()
 
 
-def build_metadata_dict(navigation: Navigation, options: RankOptions, provenance: Provenance) -> dict[str, Json]:
+def build_metadata_dict(
+    navigation: Navigation, options: RankOptions, provenance: Provenance, label: dict[str, Json] | None = None
+) -> dict[str, Json]:
     """The JSON document of one image (seed 000's conditional keys).
 
     ``rotation_deg`` and ``sigma_rotation_deg`` are there only when a rotation was fitted, and null when it was fitted
@@ -81,6 +84,8 @@ def build_metadata_dict(navigation: Navigation, options: RankOptions, provenance
         Rank tiers.
     provenance
         What it was made from.
+    label
+        What the product's own label says, as JSON values.
 
     Returns
     -------
@@ -97,14 +102,18 @@ def build_metadata_dict(navigation: Navigation, options: RankOptions, provenance
     }  # fmt: skip
     document |= _answer(estimate, state)
     document["pointing"] = _pointing(estimate, state, navigation.reason)
+    document["bodies"] = [_body(fate) for fate in navigation.bodies]
     document["frame"] = None if navigation.frame is None else _frame_figures(navigation.frame)
     answers: list[Json] = [_technique(result, estimate) for result in navigation.results]
     document["techniques"] = [*answers, *(_failure(failure) for failure in navigation.failures)]
+    document["label"] = label
     document["provenance"] = _provenance(provenance)
     return document
 
 
-def error_document(image_id: str, reason: StatusReason, detail: str, provenance: Provenance) -> dict[str, Json]:
+def error_document(
+    image_id: str, reason: StatusReason, detail: str, provenance: Provenance, label: dict[str, Json] | None = None
+) -> dict[str, Json]:
     """Document of an image that could not be worked on: same keys, nothing known.
 
     Parameters
@@ -115,6 +124,8 @@ def error_document(image_id: str, reason: StatusReason, detail: str, provenance:
         Why.
     provenance
         As far as it goes.
+    label
+        What the product's own label says, where it could be read.
 
     Returns
     -------
@@ -126,7 +137,8 @@ def error_document(image_id: str, reason: StatusReason, detail: str, provenance:
         "schema": SCHEMA, "image_id": image_id, "mission": "UNKNOWN", "camera": "UNKNOWN", "time_utc": None, "et": None,
         "exposure_s": None, "status": status.value, "status_reason": reason.value, "detail": detail,
         "rank": Rank.FAILED.value, "confidence": None, "offset_px": None, "sigma_px": None, "covariance_px2": None,
-        "observable": None, "pointing": None, "frame": None, "techniques": [], "provenance": _provenance(provenance),
+        "observable": None, "pointing": None, "bodies": [], "frame": None, "techniques": [], "label": label,
+        "provenance": _provenance(provenance),
     }  # fmt: skip
 
 
@@ -209,6 +221,14 @@ def _frame_figures(frame: Frame) -> dict[str, Json]:
         "gain_e_per_dn": frame.gain_e_per_dn, "missing_share": frame.missing_share,
         "saturated_share": frame.saturated_share, "psf_sigma_px": frame.spread.sigma_px,
         "trail_px": list(frame.spread.trail_vu),
+    }  # fmt: skip
+
+
+def _body(fate: BodyFate) -> Json:
+    centre: Json = None if fate.centre_vu is None else [round(x, _PIXEL_DIGITS) for x in fate.centre_vu]
+    return {
+        "name": fate.name, "centre_vu": centre, "diameter_px": round(fate.diameter_px, _PIXEL_DIGITS),
+        "phase_deg": round(fate.phase_deg, _PIXEL_DIGITS), "left_out": fate.reason,
     }  # fmt: skip
 
 

@@ -25,6 +25,10 @@ SCHEMAS: dict[str, pa.Schema] = {
     "offsets": pa.schema([
         *_IDENTITY,
         _field("time_utc", _TEXT, "ISO-8601 UTC", "mid-exposure"),
+        _field("product_id", _TEXT, "", "the label's name of the product; null where it has none"),
+        _field("target", _TEXT, "", "what the label says was aimed at"),
+        _field("filter", _TEXT, "", "filters by the label, separated by '+'"),
+        _field("exposure_s", _REAL, "s", "exposure; null where unknown"),
         _field("status", _TEXT, "", "success, failed, conflicted or error"),
         _field("status_reason", _TEXT, "", "the one cause behind the status"),
         _field("rank", _TEXT, "", "high, medium, low, failed or conflicted"),
@@ -129,6 +133,7 @@ def offset_row(document: Mapping[str, Json]) -> Row:
     row: Row = _identity(document)
     for key in ("time_utc", "status", "status_reason", "rank", "confidence", "detail"):
         row[key] = document[key]
+    row |= _said_by_label(document)
     row["offset_dv_px"], row["offset_du_px"] = _pair(document["offset_px"])
     row["sigma_dv_px"], row["sigma_du_px"] = _pair(document["sigma_px"])
     covariance = document["covariance_px2"]
@@ -150,6 +155,18 @@ def offset_row(document: Mapping[str, Json]) -> Row:
     row["image_class"] = frame["image_class"] if isinstance(frame, dict) else None
     row["config_digest"] = provenance["config_digest"] if isinstance(provenance, dict) else None
     return row
+
+
+def _said_by_label(document: Mapping[str, Json]) -> Row:
+    label = document.get("label")
+    said = label if isinstance(label, dict) else {}
+    filters = said.get("filters")
+    exposure = document["exposure_s"]
+    return {
+        "product_id": said.get("product_id"), "target": said.get("target"),
+        "filter": "+".join(map(str, filters)) if isinstance(filters, list) and filters else None,
+        "exposure_s": said.get("exposure_s") if exposure is None else exposure,
+    }  # fmt: skip
 
 
 def technique_rows(document: Mapping[str, Json]) -> list[Row]:

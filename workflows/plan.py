@@ -18,11 +18,11 @@ from catalogs.archive import (
     ImageRef,
     StarTableRef,
     file_stamp,
-    list_images,
     stem,
 )
 from catalogs.bodies import BodyBlock, merged_blocks
 from catalogs.geometry import first_problem
+from catalogs.listing import list_images
 from catalogs.star_sources import TableProblem, read_table
 from catalogs.stars import BUILT_IN_NAMES, StarIndex, added_index, build_index, built_in_index, cache_folder, open_index
 from pipeline.curate import Json
@@ -66,7 +66,7 @@ class Setup:
 
     def inputs_of(self, ref: ImageRef) -> tuple[str, ...]:
         """Paths, relative to the archive, whose bytes decide an image's answer."""
-        paths = [ref.path]
+        paths = [ref.path, *ref.companions]
         if self.archive.description.geometry != "header":
             paths.append(stem(ref.path) + SIDECAR_SUFFIX)
         if self.per_image_stars:
@@ -86,7 +86,7 @@ class Setup:
     @cached_property
     def _shared_digest(self) -> str:
         """Digest of what all images have in common: computed once, for it costs as much as a fast stage."""
-        description = self.archive.description.model_dump(mode="json", exclude={"name", "images"})
+        description = self.archive.description.model_dump(mode="json", exclude={"name", "images", "select"})
         # Which keys of a body's block are said decides what they hide, which their values alone do not tell.
         bodies = {name: block.model_dump(mode="json") for name, block in self.bodies.items()}
         parts: list[object] = [self.configuration.digest(), self.software, description, bodies, list(self.star_digests)]

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from posixpath import dirname
+from posixpath import basename, dirname
 
 import cv2
 import numpy as np
@@ -17,7 +17,8 @@ from catalogs.archive import SIDECAR_SUFFIX, STARS_SUFFIX, Archive, ImageRef, fi
 from catalogs.bodies import BodyModels
 from catalogs.header import state_from_header
 from catalogs.images import RawImage, read_image
-from catalogs.instruments import InstrumentBlock, identify
+from catalogs.instruments import InstrumentBlock
+from catalogs.labels import Label, read_label
 from catalogs.shapes import read_shape
 from catalogs.sidecar import state_from_sidecar
 from catalogs.star_sources import TableProblem, read_table
@@ -84,6 +85,7 @@ class Inputs:
         self._stamps: dict[str, tuple[int, str] | None] = {}
         self.data: dict[str, bytes | None] = {}
         self.digests: dict[str, str | None] = {}
+        self.label: Label | None = None
 
     def read(self, path: str) -> None:
         """Read a file, or note that it is not there.
@@ -235,20 +237,25 @@ class ImageRunner:
         data = inputs.data[ref.path]
         if data is None:
             raise ImageError(StatusReason.IMAGE_NOT_FOUND, f"{ref.path} is not there")
-        raw = read_image(data, ref.path)
+        beside = {basename(path): found for path in ref.companions if (found := inputs.data[path]) is not None}
+        raw = read_image(data, ref.path, beside)
+        description, blocks = self._setup.archive.description, self._setup.configuration.instruments
+        label = inputs.label = read_label(raw, blocks, description.instrument)
         watch.lap("read")
-        state, block, source = self._state(ref, raw, inputs)
+        state, block, source = self._state(ref, raw, label, inputs)
         watch.lap("geometry")
         stars = self._stars(ref, state, inputs)
         watch.lap("catalog")
         navigation: Navigation = navigate(raw.pixels, _flags(raw, block), state, stars, self._options, watch.lap)
         rank = self._setup.configuration.orchestrator.rank
-        return build_metadata_dict(navigation, rank, self._provenance(ref, inputs, source))
+        return build_metadata_dict(navigation, rank, self._provenance(ref, inputs, source), label.document())
 
-    def _state(self, ref: ImageRef, raw: RawImage, inputs: Inputs) -> tuple[State, InstrumentBlock | None, str]:
+    def _state(
+        self, ref: ImageRef, raw: RawImage, label: Label, inputs: Inputs
+    ) -> tuple[State, InstrumentBlock | None, str]:
         """Geometry from the sidecar where there is one (and it is allowed), else from the header."""
-        description, blocks = self._setup.archive.description, self._setup.configuration.instruments
-        block = blocks[description.instrument] if description.instrument else identify(raw.header, blocks)
+        description = self._setup.archive.description
+        block = self._setup.configuration.instruments[label.block] if label.block is not None else None
         path = stem(ref.path) + SIDECAR_SUFFIX
         sidecar = inputs.data.get(path)
         if sidecar is not None:
@@ -292,7 +299,8 @@ class ImageRunner:
         )  # fmt: skip
 
     def _error(self, ref: ImageRef, inputs: Inputs, reason: StatusReason, detail: str) -> dict[str, Json]:
-        return error_document(ref.image_id, reason, detail, self._provenance(ref, inputs, None))
+        label = None if inputs.label is None else inputs.label.document()
+        return error_document(ref.image_id, reason, detail, self._provenance(ref, inputs, None), label)
 
     def _mark(self, ref: ImageRef, inputs: Inputs, document_sha256: str, watch: Stopwatch) -> None:
         """The mark comes after the document: a kill in between only makes the image be done again."""

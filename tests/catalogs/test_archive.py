@@ -8,7 +8,8 @@ from pathlib import Path
 import fsspec
 import pytest
 
-from catalogs.archive import ImageRef, file_stamp, list_images, open_archive, read_bytes
+from catalogs.archive import ImageRef, file_stamp, open_archive, read_bytes
+from catalogs.listing import list_images
 from pipeline.errors import ConfigurationError
 from workflows.config import load_configuration
 
