@@ -3,6 +3,7 @@
 from dataclasses import dataclass, replace
 from enum import StrEnum
 
+import cv2
 import numpy as np
 from pydantic import Field
 
@@ -142,6 +143,42 @@ def make_frame(pixels: Image, flagged: BoolArray | None, state: State, options: 
         background_dn=float(np.median(background.tile_level)), noise_dn=noise,
         missing_share=_share(missing), saturated_share=_share(saturated),
     )  # fmt: skip
+
+
+def without_light_of(covered: BoolArray, frame: Frame, state: State, options: FrameOptions) -> Frame:
+    """The same frame with extended bodies taken out, so that point sources beside them can be looked for.
+
+    Parameters
+    ----------
+    covered
+        (rows, cols) True where a body is.
+    frame
+        Of :func:`make_frame`.
+    state
+        Its geometry.
+    options
+        Limits.
+
+    Returns
+    -------
+    Frame
+        Level, noise and bad pixels renewed; the frame itself where nothing is covered.
+    """
+    if not covered.any():
+        return frame
+    # A limb's blur, and the wings of a bright one, reach beyond the body itself.
+    reach = 2 * int(np.ceil(4.0 * frame.spread.sigma_px) + 3) + 1
+    near = cv2.dilate(covered.astype(np.uint8), cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (reach, reach))) > 0
+    bad = frame.bad | near
+    if bad.all():
+        return frame
+    detector = state.detector
+    floor = _read_noise(detector, False) or 0.0
+    background, _ = _level(frame.raw, bad, replace(detector, gain_e_per_dn=frame.gain_e_per_dn), floor, options)
+    pixels = frame.raw - background.level
+    pixels[bad & ~frame.saturated] = 0.0
+    saturated = frame.saturated & ~near
+    return replace(frame, pixels=pixels, sigma=background.sigma, bad=bad, saturated=saturated)
 
 
 def _read_noise(detector: Detector, integral: bool) -> float | None:

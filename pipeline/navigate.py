@@ -1,20 +1,29 @@
 """One image from start to end."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from pydantic import Field
 
 from pipeline.ensemble import EnsembleOptions, _CombinedEstimate, ensemble
 from pipeline.errors import ImageFailure
-from pipeline.frame import Frame, FrameOptions, make_frame
+from pipeline.frame import Frame, FrameOptions, make_frame, without_light_of
 from pipeline.imaging.detect import DetectionOptions, detect_point_sources
 from pipeline.options import Options
+from pipeline.predict.bodies import BodyFate, BodyPredictionOptions, BodyScene, predict_bodies
 from pipeline.predict.stars import PredictedStars, StarPredictionOptions, predict_stars
 from pipeline.records import BoolArray, FloatArray, Image, StarTable, State
 from pipeline.status import StatusReason
 from pipeline.techniques.base import NavContext, Prior, TechniqueFailure, TechniqueResult
+from pipeline.techniques.body_blob import BodyBlobOptions, body_blob_nav
+from pipeline.techniques.body_disc import BodyDiscOptions, DiscFix, body_disc_nav, find_disc
+from pipeline.techniques.body_limb import (
+    BodyLimbOptions,
+    BodyTerminatorOptions,
+    body_limb_nav,
+    body_terminator_nav,
+)
 from pipeline.techniques.star_field import StarFieldOptions, star_field_nav
 from pipeline.techniques.star_refine import StarRefineOptions, star_refine_nav
 from pipeline.techniques.star_unique import StarUniqueOptions, star_unique_nav
@@ -26,6 +35,10 @@ class TechniquesOptions(Options):
     StarFieldFromCatalogNav: StarFieldOptions = StarFieldOptions()
     StarUniqueMatchNav: StarUniqueOptions = StarUniqueOptions()
     StarRefineNav: StarRefineOptions = StarRefineOptions()
+    BodyLimbNav: BodyLimbOptions = BodyLimbOptions()
+    BodyTerminatorNav: BodyTerminatorOptions = BodyTerminatorOptions()
+    BodyDiscCorrelateNav: BodyDiscOptions = BodyDiscOptions()
+    BodyBlobNav: BodyBlobOptions = BodyBlobOptions()
 
 
 class NavigationOptions(Options):
@@ -34,6 +47,7 @@ class NavigationOptions(Options):
     frame: FrameOptions = FrameOptions()
     detection: DetectionOptions = DetectionOptions()
     stars: StarPredictionOptions = StarPredictionOptions()
+    body_prediction: BodyPredictionOptions = BodyPredictionOptions()
     techniques: TechniquesOptions = TechniquesOptions()
     ensemble: EnsembleOptions = Field(default_factory=EnsembleOptions)
 
@@ -54,6 +68,8 @@ class Navigation:
         Techniques with and without an answer, in the order in which they ran.
     reason, detail
         How the image ends, and one line about it.
+    bodies
+        What became of each body of the State.
     """
 
     state: State
@@ -63,6 +79,7 @@ class Navigation:
     failures: tuple[TechniqueFailure, ...]
     reason: StatusReason
     detail: str
+    bodies: tuple[BodyFate, ...] = ()
 
 
 StageListener = Callable[[str], None]
@@ -106,25 +123,83 @@ def navigate(
         return Navigation(state, None, None, (), (), failure.reason, failure.detail)
     on_stage("frame")
     predicted = predict_stars(stars, state, frame, options.stars)
+    scene = predict_bodies(state, frame.spread.sigma_px, options.body_prediction)
     on_stage("predict")
-    outcomes = _first_pass(predicted, frame, context, options, on_stage)
+    outcomes: list[_Outcome] = []
+    star_frame = frame
+    if len(scene):
+        fix = _find(scene, frame, context, options.techniques)
+        on_stage("body_disc")
+        outcomes += _body_pass(scene, frame, fix, context, options.techniques, on_stage)
+        if len(predicted):
+            star_frame = without_light_of(_lit_pixels(scene, fix, frame), frame, state, options.frame)
+            on_stage("body_mask")
+    if len(predicted) or not len(scene):
+        outcomes += _first_pass(predicted, star_frame, context, options, on_stage)
     first = _fuse(outcomes, context, state, options)
-    if first is not None and first.reason in (StatusReason.NAVIGATED, StatusReason.NAVIGATED_AT_EDGE):
-        outcomes += _second_pass(predicted, frame, first, context, options)
+    usable = first is not None and first.reason in (StatusReason.NAVIGATED, StatusReason.NAVIGATED_AT_EDGE)
+    if first is not None and usable and len(predicted):
+        outcomes += _second_pass(predicted, star_frame, first, context, options)
         on_stage("refine")
     estimate = _fuse(outcomes, context, state, options)
     on_stage("ensemble")
-    return _conclude(state, frame, estimate, outcomes)
+    return replace(_conclude(state, frame, estimate, outcomes), bodies=scene.fates)
+
+
+def _find(scene: BodyScene, frame: Frame, context: NavContext, techniques: TechniquesOptions) -> DiscFix | str:
+    """Rendered bodies searched for and fitted, whoever uses that."""
+    users = (techniques.BodyDiscCorrelateNav, techniques.BodyLimbNav, techniques.BodyTerminatorNav)
+    if not any(user.enabled for user in users):
+        return "not looked for"
+    return find_disc(scene, frame, context, techniques.BodyDiscCorrelateNav)
+
+
+def _body_pass(
+    scene: BodyScene,
+    frame: Frame,
+    fix: DiscFix | str,
+    context: NavContext,
+    techniques: TechniquesOptions,
+    on_stage: StageListener,
+) -> list[_Outcome]:
+    """Techniques on planets and moons; through the point spread that the disc shows, where it was found."""
+    outcomes: list[_Outcome] = []
+    found = fix if isinstance(fix, DiscFix) else None
+    scene = found.scene if found else scene
+    if techniques.BodyDiscCorrelateNav.enabled:
+        outcomes.append(body_disc_nav(fix, context, techniques.BodyDiscCorrelateNav))
+    if techniques.BodyLimbNav.enabled:
+        outcomes.append(body_limb_nav(scene, frame, found.fit if found else None, context, techniques.BodyLimbNav))
+        on_stage("body_limb")
+    if techniques.BodyTerminatorNav.enabled and found:
+        confidence, options = found.acquisition.confidence, techniques.BodyTerminatorNav
+        outcomes.append(body_terminator_nav(scene, frame, found.fit, confidence, context, options))
+        on_stage("body_terminator")
+    if techniques.BodyBlobNav.enabled:
+        outcomes.append(body_blob_nav(scene, frame, context, techniques.BodyBlobNav))
+        on_stage("body_blob")
+    return outcomes
+
+
+def _lit_pixels(scene: BodyScene, fix: DiscFix | str, frame: Frame) -> BoolArray:
+    """Pixels that bodies cover where they were found; where they were not, no pixel is known to be a body's."""
+    covered = np.zeros(frame.raw.shape, bool)
+    if isinstance(fix, DiscFix):
+        cutout = fix.fit.cutout
+        window = cutout.window
+        body = (cutout.template.image > 0) | (cutout.template.night > 0)
+        covered[window.v0 : window.v0 + window.rows, window.u0 : window.u0 + window.cols] = body
+    return covered
 
 
 def _first_pass(
     predicted: PredictedStars, frame: Frame, context: NavContext, options: NavigationOptions, on_stage: StageListener
 ) -> list[_Outcome]:
-    """Techniques that need no prior."""
+    """Techniques on stars that need no prior."""
     techniques = options.techniques
     if not len(predicted):
         reason = StatusReason.NO_FEATURES_PREDICTED
-        return [TechniqueFailure("StarFieldFromCatalogNav", reason, "no catalogue star in or near the frame")]
+        return [TechniqueFailure("StarFieldFromCatalogNav", reason, "no catalogue star or body in or near the frame")]
     sources = detect_point_sources(
         frame.pixels, frame.bad, frame.saturated, frame.sigma, frame.gain_e_per_dn, frame.spread, options.detection
     )
@@ -182,6 +257,9 @@ def _conclude(state: State, frame: Frame, estimate: _CombinedEstimate | None, ou
     if estimate is not None:
         detail = f"fused from {', '.join(estimate.members)}"
         return Navigation(state, frame, estimate, results, failures, estimate.reason, detail)
+    if results:
+        detail = f"{', '.join(result.technique for result in results)}: not to be trusted"
+        return Navigation(state, frame, None, results, failures, StatusReason.NO_MATCH, detail)
     if not failures:
         return Navigation(state, frame, None, (), (), StatusReason.NO_MATCH, "no technique is enabled")
     worst = min(failures, key=lambda failure: _TELLING.index(failure.reason))

@@ -18,6 +18,7 @@ from pipeline.frame import FrameOptions
 from pipeline.imaging.detect import DetectionOptions
 from pipeline.navigate import NavigationOptions, TechniquesOptions
 from pipeline.options import Options
+from pipeline.predict.bodies import BodyPredictionOptions
 from pipeline.predict.stars import StarPredictionOptions
 
 Tree = dict[str, object]
@@ -40,13 +41,15 @@ class Configuration(Options):
     frame: FrameOptions = FrameOptions()
     detection: DetectionOptions = DetectionOptions()
     stars: StarPredictionOptions = StarPredictionOptions()
+    body_prediction: BodyPredictionOptions = BodyPredictionOptions()
     techniques: TechniquesOptions = TechniquesOptions()
     orchestrator: OrchestratorOptions = OrchestratorOptions()
 
     def navigation(self) -> NavigationOptions:
         """The part that steers one image."""
         return NavigationOptions(
-            frame=self.frame, detection=self.detection, stars=self.stars, techniques=self.techniques,
+            frame=self.frame, detection=self.detection, stars=self.stars,
+            body_prediction=self.body_prediction, techniques=self.techniques,
             ensemble=self.orchestrator.ensemble,
         )  # fmt: skip
 

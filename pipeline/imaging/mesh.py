@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.imaging.illumination import reflectance
-from pipeline.imaging.render import Window
-from pipeline.records import FloatArray, Image, Record
+from pipeline.imaging.render import Cells, Window
+from pipeline.records import FloatArray, Record
 
 # Shadow map: cells along the body's extent, and the depth (in its cells) by which a facet never shadows itself.
 _SHADOW_CELLS = 700
@@ -45,20 +45,19 @@ class MeshSolid(Record):
         self._freeze(points_km=(None, 3), pixels_vu=(None, 2), facets=(None, 3), sun=(3,))
 
 
-def render_meshes(cells: Image, meshes: list[MeshSolid], window: Window, over: int) -> None:
+def render_meshes(cells: Cells, meshes: list[MeshSolid], window: Window) -> None:
     """Draw meshes over what the cells of a window hold.
 
     Parameters
     ----------
     cells
-        (rows * over, cols * over) float32, changed in place.
+        Changed in place.
     meshes
         Farthest first.
     window
         Pixels of the cells.
-    over
-        Cells along a pixel's side.
     """
+    over = cells.over
     for mesh in meshes:
         # Cell (i, j) has its centre at v0 - 0.5 + (i + 0.5) / over.
         rows = (mesh.pixels_vu[:, 0] - window.v0 + 0.5) * over - 0.5
@@ -66,9 +65,11 @@ def render_meshes(cells: Image, meshes: list[MeshSolid], window: Window, over: i
         places = np.stack([rows, cols, 1.0 / mesh.points_km[:, 2]], axis=1)
         shadow, axes, start, step = _shadow_map(mesh)
         light = _facet_light(mesh.points_km, mesh.facets, mesh.sun, mesh.law, mesh.parameter)
-        depth = np.zeros(cells.shape, np.float64)
+        depth = np.zeros(cells.light.shape, np.float64)
         bias = _SHADOW_BIAS_CELLS * step
-        _fill(cells, depth, places, mesh.points_km, mesh.facets, light, shadow, axes, start, step, bias)
+        _fill(
+            cells.light, cells.cover, depth, places, mesh.points_km, mesh.facets, light, shadow, axes, start, step, bias
+        )
 
 
 def _shadow_map(mesh: MeshSolid) -> tuple[FloatArray, FloatArray, FloatArray, float]:
@@ -120,7 +121,7 @@ def _facet_light(points, facets, sun, law, parameter):  # type: ignore[no-untype
 
 
 @numba.njit(cache=True, nogil=True)
-def _fill(cells, depth, places, points, facets, light, shadow, axes, start, step, bias):  # type: ignore[no-untyped-def]
+def _fill(cells, cover, depth, places, points, facets, light, shadow, axes, start, step, bias):  # type: ignore[no-untyped-def]
     for f in range(facets.shape[0]):
         if light[f] < 0.0:
             continue
@@ -155,3 +156,4 @@ def _fill(cells, depth, places, points, facets, light, shadow, axes, start, step
                     if inside and shadow[s, t] > axes[2] @ here + bias:
                         value = 0.0
                 cells[y, x] = value
+                cover[y, x] = 1.0

@@ -157,7 +157,7 @@ def _in_shadow(px, py, pz, sun, occluders):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def _draw(cells, slopes, origin, over, inner, centre, form, sun, law, parameter, brightness, occluders):  # type: ignore[no-untyped-def]
+def _draw(cells, cover, slopes, origin, over, inner, centre, form, sun, law, parameter, brightness, occluders):  # type: ignore[no-untyped-def]
     """Add one solid to the cells, in front of what they hold.
 
     The ray is written d = centre/z + e: then ``disc = cBc/z^2 + 2 e.Bc/z + (e.Bc)^2 - (cBc - 1) eBe`` has no
@@ -229,6 +229,7 @@ def _draw(cells, slopes, origin, over, inner, centre, form, sun, law, parameter,
             if covered:
                 total = samples * samples
                 cells[i, j] = brightness * light / total + (1.0 - covered / total) * cells[i, j]
+                cover[i, j] += (1.0 - cover[i, j]) * covered / total
 
 
 def cells_per_pixel(sigma_px: float, diameter_px: float) -> int:
@@ -250,23 +251,46 @@ def cells_per_pixel(sigma_px: float, diameter_px: float) -> int:
     return max(need, 2 if diameter_px < 500.0 else 1)
 
 
+@dataclass(frozen=True, eq=False)
+class Cells:
+    """Canvas of a rendering, before any blur.
+
+    Attributes
+    ----------
+    light
+        (rows * over, cols * over) float32 radiance.
+    cover
+        Same shape, share of a cell that a body covers, lit or not.
+    over
+        Cells along a pixel's side.
+    """
+
+    light: Image
+    cover: Image
+    over: int
+
+    @staticmethod
+    def blank(window: Window, over: int) -> "Cells":
+        """Sky over a window."""
+        shape = (window.rows * over, window.cols * over)
+        return Cells(np.zeros(shape, np.float32), np.zeros(shape, np.float32), over)
+
+
 def render_cells(
-    cells: Image, solids: list[Solid], rays: RayGrid, window: Window, over: int, boxes: list[Window], inner: int = 1
+    cells: Cells, solids: list[Solid], rays: RayGrid, window: Window, boxes: list[Window], inner: int = 1
 ) -> None:
     """Draw bodies over what the cells of a window hold, before any blur.
 
     Parameters
     ----------
     cells
-        (rows * over, cols * over) float32, changed in place.
+        Changed in place.
     solids
         Bodies, farthest first: nearer ones hide what is behind them.
     rays
         Of a window that holds this one.
     window
         Pixels of the cells.
-    over
-        Cells along a pixel's side.
     boxes
         Pixels that each body can touch.
     inner
@@ -277,9 +301,10 @@ def render_cells(
         if not part.pixels:
             continue
         rows, cols = part.slices_in(window)
-        view = cells[rows.start * over : rows.stop * over, cols.start * over : cols.stop * over]
+        over = cells.over
+        inside = np.s_[rows.start * over : rows.stop * over, cols.start * over : cols.stop * over]
         _draw(
-            view, _grid_for(rays, part), float(RAY_SPACING_PX), over, inner, solid.centre_km, solid.form, solid.sun,
+            cells.light[inside], cells.cover[inside], _grid_for(rays, part), float(RAY_SPACING_PX), over, inner, solid.centre_km, solid.form, solid.sun,
             solid.law, solid.parameter, solid.brightness, solid.shadowed_by,
         )  # fmt: skip
 
@@ -298,22 +323,28 @@ def _grid_for(rays: RayGrid, part: Window) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class Template:
-    """Predicted image and its derivatives.
+    """Predicted image and its derivatives, each (rows, cols) float32.
 
     Attributes
     ----------
     window
         Pixels that it covers.
     image
-        (rows, cols) float32, brightness 1 for a surface lit and seen from straight above.
+        Brightness 1 for a surface lit and seen from straight above.
     along_v, along_u
-        (rows, cols) float32, derivative of ``image`` with respect to v and u, per pixel.
+        Derivative of ``image`` with respect to v and u, per pixel.
+    night
+        Share of a pixel that unlit surface covers: its light (planetshine) is no part of ``image``.
+    widening
+        Derivative of ``image`` with respect to the variance of the point spread, per px^2.
     """
 
     window: Window
     image: Image
     along_v: Image
     along_u: Image
+    night: Image
+    widening: Image
 
 
 def gaussian_kernels(sigma: float) -> tuple[FloatArray, FloatArray]:
@@ -338,35 +369,53 @@ def gaussian_kernels(sigma: float) -> tuple[FloatArray, FloatArray]:
     return smooth, slope
 
 
-def blur(cells: Image, window: Window, sigma_px: float, over: int, with_slopes: bool = True) -> Template:
+def blur(cells: Cells, window: Window, sigma_px: float) -> Template:
     """Optics and detector: cells to a template.
 
     Parameters
     ----------
     cells
-        (rows * over, cols * over).
+        Over the window.
     window
-        Their pixels.
+        Pixels.
     sigma_px
         Gaussian core, before integration over the pixel.
-    over
-        Cells along a pixel's side.
-    with_slopes
-        Whether derivatives are wanted; else they stand as the image itself.
 
     Returns
     -------
     Template
         Over the same window; within four sigmas of its border the light from outside is missing.
     """
+    over = cells.over
     smooth, slope = gaussian_kernels(sigma_px * over)
-    size = (window.cols, window.rows)
-    planes = []
-    kernels = ((smooth, smooth), (slope, smooth), (smooth, slope))
-    for kernel_v, kernel_u in kernels if with_slopes else kernels[:1]:
-        plane = cv2.sepFilter2D(cells, cv2.CV_32F, kernel_u, kernel_v, borderType=cv2.BORDER_REPLICATE)
-        planes.append(plane if over == 1 else cv2.resize(plane, size, interpolation=cv2.INTER_AREA))
-    if not with_slopes:
-        return Template(window, planes[0], planes[0], planes[0])
-    image, along_v, along_u = planes
-    return Template(window, image, along_v * np.float32(over), along_u * np.float32(over))
+    bend = _second_derivative(sigma_px * over)
+    image = _filtered(cells.light, smooth, smooth, window, over)
+    along_v = _filtered(cells.light, slope, smooth, window, over) * np.float32(over)
+    along_u = _filtered(cells.light, smooth, slope, window, over) * np.float32(over)
+    # The blurred image obeys the heat equation: dT/d(variance) is half its Laplacian.
+    laplacian = _filtered(cells.light, bend, smooth, window, over) + _filtered(cells.light, smooth, bend, window, over)
+    night = _filtered(np.where(cells.light > 0.0, np.float32(0.0), cells.cover), smooth, smooth, window, over)
+    return Template(window, image, along_v, along_u, night, laplacian * np.float32(0.5 * over**2))
+
+
+def blur_image(cells: Cells, window: Window, sigma_px: float) -> Image:
+    """The image of :func:`blur` alone, for searches."""
+    smooth, _ = gaussian_kernels(sigma_px * cells.over)
+    return _filtered(cells.light, smooth, smooth, window, cells.over)
+
+
+def _filtered(cells: Image, kernel_v: FloatArray, kernel_u: FloatArray, window: Window, over: int) -> Image:
+    plane = cv2.sepFilter2D(cells, cv2.CV_32F, kernel_u, kernel_v, borderType=cv2.BORDER_REPLICATE)
+    if over > 1:
+        plane = cv2.resize(plane, (window.cols, window.rows), interpolation=cv2.INTER_AREA)
+    return np.asarray(plane, np.float32)
+
+
+def _second_derivative(sigma: float) -> FloatArray:
+    """Kernel of the Gaussian's second derivative: zero on planes, exact on a parabola."""
+    reach = max(1, ceil(4.0 * sigma))
+    x = np.arange(-reach, reach + 1, dtype=float)
+    smooth = np.exp(-0.5 * (x / sigma) ** 2)
+    smooth /= smooth.sum()
+    kernel = (x**2 - (smooth * x**2).sum()) * smooth
+    return np.asarray(2.0 * kernel / (kernel * x**2).sum())

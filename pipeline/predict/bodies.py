@@ -4,7 +4,7 @@ A body that cannot be used says why: its :class:`BodyFate` stands in the record.
 attitudes; :class:`BodyScene` keeps the few templates that techniques share.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from pydantic import Field
@@ -15,17 +15,19 @@ from pipeline.geometry.pointing import corrected_attitude
 from pipeline.imaging.illumination import law_of
 from pipeline.imaging.mesh import MeshSolid, render_meshes
 from pipeline.imaging.render import (
+    Cells,
     RayGrid,
     Solid,
     Template,
     Window,
     blur,
+    blur_image,
     cells_per_pixel,
     ray_grid,
     render_cells,
 )
 from pipeline.options import Options
-from pipeline.records import Body, CameraModel, FloatArray, State
+from pipeline.records import Body, CameraModel, FloatArray, Image, State
 
 _LIMB_SAMPLES = 96
 # Pixels of sky that a template keeps around a body, beyond the reach of the point spread.
@@ -251,7 +253,7 @@ class BodyScene:
         bottom, right = max(b.v0 + b.rows for b in boxes), max(b.u0 + b.cols for b in boxes)
         return Window(top, left, bottom - top, right - left)
 
-    def render(self, views: tuple[BodyView, ...], window: Window, coarse: bool = False) -> Template:
+    def render(self, views: tuple[BodyView, ...], window: Window) -> Template:
         """Draw bodies into a window.
 
         Parameters
@@ -260,32 +262,39 @@ class BodyScene:
             Farthest first.
         window
             Pixels inside the canvas.
-        coarse
-            One cell a pixel, whatever the point spread: good enough to find a body by.
 
         Returns
         -------
         Template
-            Blurred.
+            Blurred, with derivatives.
         """
-        if not window.pixels or self.rays is None:
-            empty = np.zeros((window.rows, window.cols), np.float32)
-            return Template(window, empty, empty, empty)
-        largest = max(view.diameter_px for view in views)
-        over = 1 if coarse else cells_per_pixel(self.sigma_px, largest)
+        largest = max((view.diameter_px for view in views), default=0.0)
+        over = cells_per_pixel(self.sigma_px, largest)
         if any(view.body.mesh is not None for view in views):
-            over = 1 if coarse else max(over, 2)
-        inner = 1 if coarse or largest > 60.0 else 2
-        cells = np.zeros((window.rows * over, window.cols * over), np.float32)
+            over = max(over, 2)
+        return blur(self._cells(views, window, over, 1 if largest > 60.0 else 2), window, self.sigma_px)
+
+    def render_coarse(self, window: Window) -> Image:
+        """A-priori bodies in a window, one cell a pixel: good enough to find them by."""
+        cells = self._cells(self.views, window, 1, 1)
+        # A coarse template is never sharper than its pixels can show.
+        return blur_image(cells, window, max(self.sigma_px, 0.5))
+
+    def _cells(self, views: tuple[BodyView, ...], window: Window, over: int, inner: int) -> Cells:
+        cells = Cells.blank(window, over)
+        if not window.pixels or self.rays is None:
+            return cells
         for run, is_mesh in _runs(views):
             if is_mesh:
-                meshes = [_mesh_solid(view, self.state.camera_model) for view in run]
-                render_meshes(cells, meshes, window, over)
+                render_meshes(cells, [_mesh_solid(view, self.state.camera_model) for view in run], window)
             else:
                 solids = [_solid(view, views) for view in run]
-                render_cells(cells, solids, self.rays, window, over, [view.box for view in run], inner)
-        # A coarse template is never sharper than its pixels can show.
-        return blur(cells, window, max(self.sigma_px, 0.5) if coarse else self.sigma_px, over, not coarse)
+                render_cells(cells, solids, self.rays, window, [view.box for view in run], inner)
+        return cells
+
+    def with_sigma(self, sigma_px: float) -> "BodyScene":
+        """The same scene through another point spread."""
+        return replace(self, sigma_px=sigma_px, _templates={})
 
 
 def _runs(views: tuple[BodyView, ...]) -> list[tuple[list[BodyView], bool]]:

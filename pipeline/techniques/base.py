@@ -134,7 +134,7 @@ class TechniqueResult(Record):
     confidence
         Probability, in the technique's own model, that the answer is not a mistake.
     measurements
-        Independent measurements in the fit (stars, vertices, pixels of a template).
+        Stars in the fit; 1 for techniques whose numbers of vertices or pixels say nothing of their worth.
     at_edge, at_edge_rotation
         The search ran into its bound: any of them, and the rotation's.
     spurious

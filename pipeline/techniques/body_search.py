@@ -155,7 +155,7 @@ def _prepare(scene: BodyScene, frame: Frame, context: NavContext, options: BodyS
     )
     surplus = tuple(-(-n // factors[0]) * factors[0] for n in reach)
     window = region.grown(surplus[0], surplus[1])
-    template = scene.render(scene.views, window, coarse=True).image
+    template = scene.render_coarse(window)
     rows_in, cols_in = region.slices_in(array)
     pivot = scene.pivot_vu - [window.v0, window.u0]
     return _Pyramid(

@@ -1,0 +1,186 @@
+"""What the techniques on bodies share: pixels around them, composed corrections, and information about a pivot."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline.frame import Frame
+from pipeline.geometry.pointing import move_pivot
+from pipeline.geometry.rotations import plane_rotation, plane_rotation_derivative
+from pipeline.imaging.render import Template, Window
+from pipeline.predict.bodies import BodyScene, BodyView
+from pipeline.records import BoolArray, FloatArray, Image
+from pipeline.techniques.base import NavContext
+
+# A rotation whose own sigma is above this share of its bound's is told by the bound, not by the image.
+_ROTATION_SEEN = 1.0 / 3.0
+
+
+@dataclass(frozen=True, eq=False)
+class Cutout:
+    """Image and prediction on the same pixels.
+
+    Attributes
+    ----------
+    views, template
+        Bodies under the pointing at which the template was drawn.
+    offset_vu, rotation_rad
+        That pointing, at the array centre.
+    sigma_px
+        Core of the point spread that it was drawn with.
+    data
+        (rows, cols) DN.
+    good
+        (rows, cols) True where measured.
+    """
+
+    views: tuple[BodyView, ...]
+    template: Template
+    offset_vu: FloatArray
+    rotation_rad: float
+    sigma_px: float
+    data: Image
+    good: BoolArray
+
+    @property
+    def window(self) -> Window:
+        """Pixels of the cutout."""
+        return self.template.window
+
+    def places_vu(self) -> tuple[FloatArray, FloatArray]:
+        """Row numbers (rows, 1) and column numbers (1, cols) of the array."""
+        v = self.window.v0 + np.arange(self.window.rows, dtype=float)[:, None]
+        u = self.window.u0 + np.arange(self.window.cols, dtype=float)[None, :]
+        return v, u
+
+
+def cut_out(scene: BodyScene, frame: Frame, offset_vu: FloatArray, rotation_rad: float) -> Cutout:
+    """Template near a pointing, with the image's pixels under it.
+
+    Parameters
+    ----------
+    scene
+        Bodies.
+    frame
+        Image.
+    offset_vu, rotation_rad
+        At the array centre; the template is drawn at the nearest place of the scene's grid.
+
+    Returns
+    -------
+    Cutout
+        Empty where no body reaches the array.
+    """
+    offset, rotation = scene.quantised(offset_vu, rotation_rad)
+    views, template = scene.template(offset, rotation)
+    rows, cols = template.window.slices_in(Window(0, 0, *frame.raw.shape))
+    return Cutout(views, template, offset, rotation, scene.sigma_px, frame.raw[rows, cols], ~frame.bad[rows, cols])
+
+
+@dataclass(frozen=True)
+class Levels:
+    """Brightness of a template's unit, of the sky, and of night sides, DN."""
+
+    scale: float
+    sky: float
+    night: float
+
+
+def rough_levels(cutout: Cutout) -> Levels:
+    """Brightness and sky by a plain regression of the image on the template.
+
+    Parameters
+    ----------
+    cutout
+        Both.
+
+    Returns
+    -------
+    Levels
+        Night sides count as dark.
+    """
+    x = cutout.template.image[cutout.good].astype(float)
+    y = cutout.data[cutout.good].astype(float)
+    dx = x - x.mean()
+    power = float(dx @ dx)
+    slope = float(dx @ (y - y.mean())) / power if power > 0 else 0.0
+    return Levels(slope, float(y.mean() - slope * x.mean()), 0.0)
+
+
+def compose(
+    context: NavContext,
+    offset_vu: FloatArray,
+    rotation_rad: float,
+    pivot_vu: FloatArray,
+    step: FloatArray,
+) -> tuple[FloatArray, float]:
+    """Correction at the array centre after a further small similarity about a pivot.
+
+    Parameters
+    ----------
+    context
+        Camera.
+    offset_vu, rotation_rad
+        Correction so far.
+    pivot_vu
+        (2,) pivot of the step.
+    step
+        (3,) dv, du, theta.
+
+    Returns
+    -------
+    tuple
+        (2,) offset, rotation.
+    """
+    centre = context.camera_model.centre_vu
+    landed = pivot_vu + plane_rotation(step[2]) @ (centre + offset_vu - pivot_vu) + step[:2]
+    return landed - centre, rotation_rad + float(step[2])
+
+
+def about(
+    context: NavContext, offset_vu: FloatArray, rotation_rad: float, pivot_vu: FloatArray
+) -> FloatArray:
+    """(2,) offset about a pivot of the prediction, of a correction known at the array centre."""
+    return move_pivot(offset_vu, rotation_rad, context.camera_model.centre_vu, pivot_vu)[0]
+
+
+def predicted_place(context: NavContext, offset_vu: FloatArray, rotation_rad: float, seen_vu: FloatArray) -> FloatArray:
+    """Where the a-priori prediction puts what a corrected one puts at ``seen_vu``: the pivot that a result reports."""
+    centre = context.camera_model.centre_vu
+    return np.asarray(centre + (seen_vu - centre - offset_vu) @ plane_rotation(rotation_rad))
+
+
+def turn_lever(places_vu: FloatArray, pivot_vu: FloatArray) -> FloatArray:
+    """(n, 2) derivative of places with respect to a rotation about a pivot, at zero rotation."""
+    return np.asarray((places_vu - pivot_vu) @ plane_rotation_derivative(0.0).T)
+
+
+def settled_information(information: FloatArray, context: NavContext) -> tuple[FloatArray, bool]:
+    """Information with a rotation that the image does not show taken out of it, exactly.
+
+    A circle's limb binds rotation and translation together (it sees neither apart from the other): what is left is the
+    information on their combinations, whose Schur complement in theta is zero.
+
+    Parameters
+    ----------
+    information
+        (2, 2) or (3, 3).
+    context
+        Bound of the rotation.
+
+    Returns
+    -------
+    tuple
+        Information; whether theta is observed.
+    """
+    if len(information) == 2:
+        return information, False
+    block, cross = information[:2, :2], information[:2, 2]
+    lever = np.linalg.pinv(block, rcond=1e-12) @ cross
+    own = float(information[2, 2] - cross @ lever)
+    bound = context.max_rotation_rad / np.sqrt(3.0)
+    if own > 0 and 1.0 / np.sqrt(own) < _ROTATION_SEEN * bound:
+        return information, True
+    settled = information.copy()
+    settled[2, 2] = float(lever @ block @ lever)
+    return settled, False

@@ -1,0 +1,148 @@
+"""BodyDiscCorrelateNav: the rendered bodies found by correlation and fitted pixel by pixel."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from pydantic import Field
+
+from pipeline.frame import Frame
+from pipeline.predict.bodies import BodyScene
+from pipeline.records import FloatArray
+from pipeline.status import StatusReason
+from pipeline.techniques.base import (
+    FeatureTable,
+    NavContext,
+    TechniqueFailure,
+    TechniqueOptions,
+    TechniqueResult,
+    edge_flags,
+)
+from pipeline.techniques.body_base import about, predicted_place
+from pipeline.techniques.body_search import Acquisition, BodySearchOptions, find_bodies
+from pipeline.techniques.model_errors import ModelErrorOptions
+from pipeline.techniques.template_fit import TemplateFit, fit_template
+
+NAME = "BodyDiscCorrelateNav"
+# A change of the point spread's variance is believed from so many of its sigmas on, and never below this core.
+_WIDTH_SIGMAS = 3.0
+_LEAST_SIGMA_PX, _MOST_SIGMA_PX = 0.25, 6.0
+_WIDTH_ROUNDS = 2
+
+
+class BodyDiscOptions(TechniqueOptions):
+    """Options of the correlation and of the fit after it."""
+
+    search: BodySearchOptions = BodySearchOptions()
+    errors: ModelErrorOptions = ModelErrorOptions()
+    min_correlation: float = Field(0.3, ge=0, lt=1, description="correlation of the fit below which it is spurious")
+    largest_drift_px: float = Field(6.0, gt=0, le=100, description="how far the fit may go from where it began")
+
+
+@dataclass(frozen=True, eq=False)
+class DiscFix:
+    """Where the rendered bodies were found: what other techniques on bodies may start from.
+
+    Attributes
+    ----------
+    acquisition
+        Of the search.
+    fit
+        Of the pixels.
+    scene
+        The bodies, through the point spread that the image shows.
+    """
+
+    acquisition: Acquisition
+    fit: TemplateFit
+    scene: BodyScene
+
+
+def find_disc(scene: BodyScene, frame: Frame, context: NavContext, options: BodyDiscOptions) -> DiscFix | str:
+    """Search and fit.
+
+    Parameters
+    ----------
+    scene
+        Bodies.
+    frame
+        Image.
+    context
+        Camera, bounds.
+    options
+        Limits.
+
+    Returns
+    -------
+    DiscFix or str
+        Or why nothing was found.
+    """
+    found = find_bodies(scene, frame, context, options.search)
+    if isinstance(found, str):
+        return found
+    fit = fit_template(scene, frame, found.offset_vu, found.rotation_rad, context, options.errors)
+    for _ in range(_WIDTH_ROUNDS):
+        if isinstance(fit, str) or abs(fit.variance_px2) < _WIDTH_SIGMAS * fit.variance_sigma_px2:
+            break
+        sigma = float(np.sqrt(np.clip(scene.sigma_px**2 + fit.variance_px2, _LEAST_SIGMA_PX**2, _MOST_SIGMA_PX**2)))
+        if abs(sigma - scene.sigma_px) < 0.03 * scene.sigma_px:
+            break
+        scene = scene.with_sigma(sigma)
+        fit = fit_template(scene, frame, fit.offset_vu, fit.rotation_rad, context, options.errors)
+    if isinstance(fit, str):
+        return fit
+    drift = float(np.hypot(*(fit.offset_vu - found.offset_vu)))
+    if drift > options.largest_drift_px + 0.1 * max(view.diameter_px for view in scene.views):
+        return f"the fit ran {drift:.1f} px away from the correlation's peak"
+    return DiscFix(found, fit, scene)
+
+
+def body_disc_nav(
+    fix: DiscFix | str, context: NavContext, options: BodyDiscOptions
+) -> TechniqueResult | TechniqueFailure:
+    """The fit as a technique's answer.
+
+    Parameters
+    ----------
+    fix
+        Of :func:`find_disc`.
+    context
+        Camera, bounds.
+    options
+        Limits.
+
+    Returns
+    -------
+    TechniqueResult or TechniqueFailure
+        About the centroid of the predicted centres (seed 000).
+    """
+    if isinstance(fix, str):
+        return TechniqueFailure(NAME, StatusReason.NO_FEATURES_DETECTED, fix)
+    fit = fix.fit
+    pivot = predicted_place(context, fit.offset_vu, fit.rotation_rad, fit.pivot_vu)
+    at_edge, at_edge_rotation = edge_flags(fit.offset_vu, fit.rotation_rad, context, options)
+    return TechniqueResult(
+        technique=NAME, offset_vu=about(context, fit.offset_vu, fit.rotation_rad, pivot),
+        rotation_rad=fit.rotation_rad, information=fit.information, pivot_vu=pivot,
+        confidence=fix.acquisition.confidence, at_edge=at_edge, at_edge_rotation=at_edge_rotation, spurious=fit.correlation < options.min_correlation,
+        error_sources=tuple(f"body:{name}" for name in fix.scene.names), features=_inventory(fit, context),
+        diagnostics={
+            "correlation": fit.correlation, "search_correlation": fix.acquisition.correlation,
+            "rival_correlation": fix.acquisition.rival, "chi2_per_sample": fit.chi2_per_sample,
+            "texture": fit.errors.texture, "texture_px": fit.errors.texture_px, "relief_px": fit.errors.relief_px,
+            "psf_sigma_px": fix.scene.sigma_px, "brightness_dn": fit.scale_dn, "night_dn": fit.night_dn,
+        },
+    )  # fmt: skip
+
+
+def _inventory(fit: TemplateFit, context: NavContext) -> FeatureTable:
+    """One row per body: its centre, and how far it reaches over the sky's noise."""
+    views = fit.cutout.views
+    count = len(views)
+    seen: FloatArray = np.array([view.centre_vu for view in views])
+    predicted = predicted_place(context, fit.offset_vu, fit.rotation_rad, seen)
+    sigma = float(np.sqrt(max(np.trace(np.linalg.inv(fit.information[:2, :2])) / 2.0, 0.0)))
+    return FeatureTable(
+        name=np.array([view.body.name for view in views]), kind=np.full(count, "disc"), predicted_vu=predicted,
+        measured_vu=seen, residual_vu=np.zeros((count, 2)), sigma_px=np.full(count, sigma), mag=np.full(count, np.nan),
+        snr=np.full(count, np.nan), used=np.ones(count, bool), reason=np.full(count, "", "U1"),
+    )  # fmt: skip

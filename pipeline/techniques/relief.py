@@ -1,0 +1,215 @@
+"""Pointing from shifts along outlines: generalised least squares with a body's relief as a random field.
+
+Heights of a surface about its shape are a Gaussian field on the body whose covariance falls by 1/e over some degrees.
+Its rms comes from the catalogue, where there is one, and from the residuals by restricted maximum likelihood; a second
+field of long wavelength stands for an altogether wrong shape, and a common height of a whole outline for a wrong radius
+or a hazy limb.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from pydantic import Field
+from scipy.linalg import cho_factor, cho_solve
+
+from pipeline.options import Options
+from pipeline.records import FloatArray, Record
+from pipeline.techniques.contour_fit import Segments
+from pipeline.techniques.lm import tukey_weight
+
+_ROUNDS = 3
+_FACTORS = np.array([0.3, 0.5, 0.7, 0.85, 1.0, 1.2, 1.4, 2.0, 2.8, 4.0, 8.0, 16.0, 32.0])
+_LONG_FACTORS = np.array([0.0, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0])
+_LONG_REACH_DEG = 40.0
+# A weight this small is an outlier's; it keeps the covariance finite.
+_LEAST_WEIGHT = 1e-4
+
+
+class ReliefOptions(Options):
+    """What is believed of reliefs before the image is looked at."""
+
+    known_width: float = Field(0.3, gt=0, le=3, description="1-sigma of ln(rms) where a catalogue tells it")
+    unknown_width: float = Field(1.2, gt=0, le=5, description="the same where it is guessed from the radius")
+    wrong_shape_chance: float = Field(0.05, gt=0, lt=1, description="chance of a long-wave error of the shape")
+    radius_sigmas: float = Field(3.0, gt=0, le=20, description="common height, in its sigmas, that frees the radius")
+
+
+@dataclass(frozen=True, eq=False)
+class Field_(Record):
+    """Prior of one body's relief.
+
+    Attributes
+    ----------
+    rms_px
+        Expected rms.
+    reach_deg
+        E-folding angle of the covariance.
+    known
+        Whether a catalogue says so.
+    common_px
+        1 sigma of a height that the whole outline shares.
+    """
+
+    rms_px: float
+    reach_deg: float
+    known: bool
+    common_px: float
+
+
+@dataclass(frozen=True, eq=False)
+class ReliefFit(Record):
+    """Answer of the fit.
+
+    Attributes
+    ----------
+    step
+        (2,) or (3,) change of (dv, du[, theta]) about the pivot.
+    information
+        Same size, squared.
+    residual_px, weight
+        (m,) shifts that are left; robust weights.
+    rms_px
+        Relief found.
+    long_px
+        Long-wave error found, zero where there is none.
+    common_px
+        (bodies,) height of whole outlines.
+    chi2_per_segment
+        With all errors.
+    """
+
+    step: FloatArray
+    information: FloatArray
+    residual_px: FloatArray
+    weight: FloatArray
+    rms_px: float
+    long_px: float
+    common_px: FloatArray
+    chi2_per_segment: float
+
+    def __post_init__(self) -> None:
+        size = len(self.step)
+        self._freeze(
+            step=(size,), information=(size, size), residual_px=(None,), weight=(None,), common_px=(None,)
+        )
+
+
+def fit_relief(
+    segments: Segments, lever: FloatArray | None, fields: dict[int, Field_], options: ReliefOptions
+) -> ReliefFit:
+    """Fit a pointing to segments' shifts.
+
+    Parameters
+    ----------
+    segments
+        Measured ones only.
+    lever
+        (m, 2) derivative of the places with respect to theta, None where it is no parameter.
+    fields
+        Prior of each body's relief, by its index.
+    options
+        Beliefs.
+
+    Returns
+    -------
+    ReliefFit
+        Of all bodies together.
+    """
+    design = segments.normal_vu
+    if lever is not None:
+        design = np.column_stack([design, (segments.normal_vu * lever).sum(axis=1)])
+    bodies = sorted(set(segments.body.tolist()))
+    near, far = _correlations(segments, fields)
+    common = {b: fields[b].common_px for b in bodies}
+    weight = np.ones(len(segments))
+    short, long_ = 1.0, 0.0
+    for _ in range(_ROUNDS):
+        noise = segments.sigma_px**2 / np.maximum(weight, _LEAST_WEIGHT)
+        base = np.diag(noise) + _common(segments, common)
+        short, long_ = _likeliest(segments.shift_px, design, base, near, far, (short, long_), fields, options)
+        covariance = base + short**2 * near + long_**2 * far
+        step, information, solved = _solve(segments.shift_px, design, covariance)
+        residual = segments.shift_px - design @ step
+        heights = np.array([common[b] ** 2 * float(solved[segments.body == b].sum()) for b in bodies])
+        free = [b for b, h in zip(bodies, heights, strict=True) if abs(h) > options.radius_sigmas * common[b]]
+        if any(common[b] < 1e3 for b in free):
+            common |= dict.fromkeys(free, 1e3)
+            continue
+        lifted = residual - sum(
+            np.where(segments.body == b, h, 0.0) for b, h in zip(bodies, heights, strict=True)
+        )
+        spread = np.sqrt(segments.sigma_px**2 + short**2 * np.diag(near) + long_**2 * np.diag(far))
+        weight = tukey_weight(lifted / spread, 1.0)
+    rms = float(np.sqrt(np.mean(np.diag(near)))) * short
+    long_px = float(np.sqrt(np.mean(np.diag(far)))) * long_
+    chi2 = float(residual @ solved) / max(len(segments) - design.shape[1], 1)
+    return ReliefFit(step, information, residual, weight, rms, long_px, heights, chi2)
+
+
+def _correlations(segments: Segments, fields: dict[int, Field_]) -> tuple[FloatArray, FloatArray]:
+    """Covariances of relief and of a wrong shape, both for factor one."""
+    angle = np.arccos(np.clip(segments.direction @ segments.direction.T, -1.0, 1.0))
+    rms = np.array([fields[b].rms_px for b in segments.body.tolist()])
+    reach = np.radians([fields[b].reach_deg for b in segments.body.tolist()])
+    same = segments.body[:, None] == segments.body[None, :]
+    scale = np.where(same, np.outer(rms, rms), 0.0)
+    return scale * np.exp(-angle / reach[:, None]), scale * np.exp(-angle / np.radians(_LONG_REACH_DEG))
+
+
+def _common(segments: Segments, common: dict[int, float]) -> FloatArray:
+    sigma = np.array([common[b] for b in segments.body.tolist()])
+    return np.where(segments.body[:, None] == segments.body[None, :], np.outer(sigma, sigma), 0.0)
+
+
+def _solve(shift: FloatArray, design: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Step, information, and C^-1 times the residual."""
+    factor = cho_factor(covariance, lower=True)
+    whitened = cho_solve(factor, design)
+    information = design.T @ whitened
+    step = np.linalg.pinv(information, rcond=1e-10, hermitian=True) @ (whitened.T @ shift)
+    return step, information, cho_solve(factor, shift - design @ step)
+
+
+def _restricted_likelihood(shift: FloatArray, design: FloatArray, covariance: FloatArray) -> float:
+    factor = cho_factor(covariance, lower=True)
+    whitened = cho_solve(factor, design)
+    information = design.T @ whitened
+    step = np.linalg.pinv(information, rcond=1e-10, hermitian=True) @ (whitened.T @ shift)
+    residual = shift - design @ step
+    determinant = 2.0 * float(np.log(np.diag(factor[0])).sum())
+    values = np.linalg.eigvalsh(information)
+    seen = values[values > 1e-10 * values.max()]
+    return -0.5 * (determinant + float(np.log(seen).sum()) + float(residual @ cho_solve(factor, residual)))
+
+
+def _likeliest(
+    shift: FloatArray,
+    design: FloatArray,
+    base: FloatArray,
+    near: FloatArray,
+    far: FloatArray,
+    start: tuple[float, float],
+    fields: dict[int, Field_],
+    options: ReliefOptions,
+) -> tuple[float, float]:
+    """Factors of both fields by restricted likelihood and prior, one after the other."""
+    width = options.known_width if all(f.known for f in fields.values()) else options.unknown_width
+    # Heavy tails: a catalogue that is wrong may be very wrong.
+    prior = -2.5 * np.log1p((np.log(_FACTORS) / width) ** 2 / 4.0)
+    absent, present = np.log(1.0 - options.wrong_shape_chance), np.log(options.wrong_shape_chance)
+    long_prior = np.where(_LONG_FACTORS > 0, present - np.log(len(_LONG_FACTORS) - 1), absent)
+    short, long_ = start
+    for _ in range(2):
+        scores = [
+            _restricted_likelihood(shift, design, base + f**2 * near + long_**2 * far) + p
+            for f, p in zip(_FACTORS, prior, strict=True)
+        ]
+        short = float(_FACTORS[int(np.argmax(scores))])
+        scores = [
+            _restricted_likelihood(shift, design, base + short**2 * near + g**2 * far) + p
+            for g, p in zip(_LONG_FACTORS, long_prior, strict=True)
+        ]
+        previous, long_ = long_, float(_LONG_FACTORS[int(np.argmax(scores))])
+        if long_ == previous:
+            break
+    return short, long_

@@ -1,0 +1,352 @@
+"""Rendered bodies fitted to the image pixel by pixel.
+
+Beside offset and rotation the fit has the brightness, light that night sides return, a sloping sky, and a correction of
+the point spread's width; what the rendering cannot know is in its errors (``model_errors``).
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from pipeline.frame import Frame
+from pipeline.imaging.noise import PixelNoise
+from pipeline.predict.bodies import BodyScene
+from pipeline.records import FloatArray
+from pipeline.techniques.base import NavContext
+from pipeline.techniques.body_base import Cutout, Levels, compose, cut_out, rough_levels, settled_information
+from pipeline.techniques.model_errors import (
+    ModelErrorOptions,
+    ModelErrors,
+    assumed_errors,
+    correlated_sums,
+    measured_errors,
+)
+
+_ROUNDS = 8
+_LARGEST_STEP_PX = 2.0
+_SETTLED_PX = 0.01
+# From this size on, smooth parts are averaged over blocks before the fit.
+_MANY_PIXELS = 40_000
+_BLOCK = 4
+# Share of the steepest gradient from which a pixel is taken alone.
+_STEEP = 0.08
+# Nuisances: what a night side returns, and the slope of the sky over half the cutout, relative to the brightness; the
+# width of the point spread relative to itself.
+_NIGHT_SHARE, _SKY_SLOPE_SHARE, _WIDTH_SHARE = 0.02, 0.02, 0.5
+_LEAST_VARIANCE_PX2 = 0.04
+
+
+@dataclass(frozen=True, eq=False)
+class TemplateFit:
+    """Answer of the fit.
+
+    Attributes
+    ----------
+    offset_vu, rotation_rad
+        At the array centre.
+    pivot_vu
+        Where the information holds: centroid of the bodies' centres in the image.
+    information
+        (2, 2) or (3, 3) about the pivot.
+    scale_dn, level_dn
+        Brightness of the template's unit, and of the sky.
+    night_dn
+        Brightness of night sides.
+    variance_px2, variance_sigma_px2
+        By how much the point spread's variance should grow, and its sigma.
+    correlation
+        Of image and template, weighted.
+    chi2_per_sample
+        With all of the model's errors.
+    errors
+        Of the rendering.
+    cutout
+        At the last template.
+    """
+
+    offset_vu: FloatArray
+    rotation_rad: float
+    pivot_vu: FloatArray
+    information: FloatArray
+    scale_dn: float
+    level_dn: float
+    night_dn: float
+    variance_px2: float
+    variance_sigma_px2: float
+    correlation: float
+    chi2_per_sample: float
+    errors: ModelErrors
+    cutout: Cutout
+
+    @property
+    def levels(self) -> Levels:
+        """Brightness, sky and night side, DN."""
+        return Levels(self.scale_dn, self.level_dn, self.night_dn)
+
+    def model_dn(self) -> FloatArray:
+        """(rows, cols) what the fit expects in the cutout, without the sky's slope."""
+        template = self.cutout.template
+        light = self.scale_dn * template.image.astype(float) + self.night_dn * template.night
+        return np.asarray(self.level_dn + light + self.scale_dn * self.variance_px2 * template.widening)
+
+
+@dataclass(frozen=True, eq=False)
+class _Samples:
+    """Pixels, and means of blocks of smooth ones.
+
+    ``planes`` is (n, 6): data, image, along v, along u, night, widening; ``row`` and ``col`` count from the window.
+    ``light`` and ``slope`` are the template's largest value and gradient nearby.
+    """
+
+    planes: FloatArray
+    light: FloatArray
+    slope: FloatArray
+    row: FloatArray
+    col: FloatArray
+    pixels: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class _Solution:
+    """One weighted linear solution: changes of (dv, du[, theta], brightness, night, width, sky, slopes)."""
+
+    values: FloatArray
+    gram: FloatArray
+    design: FloatArray
+    weight: FloatArray
+    residual: FloatArray
+    size: int
+
+
+def fit_template(
+    scene: BodyScene,
+    frame: Frame,
+    start_vu: FloatArray,
+    start_rad: float,
+    context: NavContext,
+    options: ModelErrorOptions,
+) -> TemplateFit | str:
+    """Fit offset and rotation of all bodies together.
+
+    Parameters
+    ----------
+    scene, frame
+        Bodies and image.
+    start_vu, start_rad
+        Pointing at the array centre, right to about a pixel.
+    context
+        Camera, bounds.
+    options
+        Assumptions about surfaces.
+
+    Returns
+    -------
+    TemplateFit or str
+        Or why there is none.
+    """
+    offset, rotation = np.asarray(start_vu, float), start_rad
+    levels: Levels | None = None
+    errors: ModelErrors | None = None
+    for _ in range(_ROUNDS):
+        cutout = cut_out(scene, frame, offset, rotation)
+        if not cutout.views or np.count_nonzero(cutout.good) < 16:
+            return "too few pixels"
+        pivot = np.mean([view.centre_vu for view in cutout.views], axis=0)
+        levels = levels or rough_levels(cutout)
+        errors = errors or assumed_errors(cutout.views, options)
+        if not levels.scale > 0:
+            return "the image is not bright where the template is"
+        samples = _sample(cutout)
+        solution = _solve(samples, cutout, frame.noise, levels, errors, pivot, context)
+        k = solution.size
+        levels = Levels(
+            levels.scale + solution.values[k], levels.sky + solution.values[k + 3], levels.night + solution.values[k + 1]
+        )
+        if not np.isfinite(solution.values).all() or not levels.scale > 0:
+            return "the fit has no solution"
+        errors = _look(cutout, frame.noise, levels, solution, options)
+        step = np.zeros(3)
+        step[:k] = solution.values[:k]
+        length = float(np.hypot(*step[:2]))
+        step *= min(1.0, _LARGEST_STEP_PX / max(length, 1e-12))
+        last = offset
+        offset, rotation = compose(context, cutout.offset_vu, cutout.rotation_rad, pivot, step)
+        again = scene.quantised(offset, rotation)
+        same = bool((again[0] == cutout.offset_vu).all()) and again[1] == cutout.rotation_rad
+        if same or float(np.hypot(*(offset - last))) < _SETTLED_PX:
+            break
+    return _answer(offset, rotation, pivot, samples, solution, cutout, frame.noise, levels, errors, context)
+
+
+def _slope_length(cutout: Cutout) -> FloatArray:
+    return np.asarray(np.hypot(cutout.template.along_v, cutout.template.along_u), float)
+
+
+def _sample(cutout: Cutout) -> _Samples:
+    """Single pixels where the template is steep or the image has gaps, means of blocks elsewhere."""
+    t = cutout.template
+    # Weights that change across a limb would turn a wrong point spread into a shift: what they are made from is held
+    # over its reach.
+    reach = 2 * int(np.ceil(2.0 * cutout.sigma_px)) + 1
+    near = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (reach, reach))
+    slope = np.hypot(t.along_v, t.along_u)
+    held = (cv2.dilate(t.image, near), cv2.dilate(slope, near))
+    planes = (cutout.data, t.image, t.along_v, t.along_u, t.night, t.widening, *held)
+    rows, cols = cutout.good.shape
+    single = cutout.good
+    blocks: list[FloatArray] = []
+    if cutout.good.size > _MANY_PIXELS:
+        rough = (slope > _STEEP * float(slope.max())) | ~cutout.good
+        tall, wide = rows // _BLOCK, cols // _BLOCK
+        inner = np.s_[: tall * _BLOCK, : wide * _BLOCK]
+        broken = rough[inner].reshape(tall, _BLOCK, wide, _BLOCK).any(axis=(1, 3))
+        smooth = ~broken
+        alone = np.ones((rows, cols), bool)
+        alone[inner] = np.repeat(np.repeat(broken, _BLOCK, axis=0), _BLOCK, axis=1)
+        single = cutout.good & alone
+        means = [cv2.resize(p[inner], (wide, tall), interpolation=cv2.INTER_AREA)[smooth] for p in planes]
+        i, j = np.nonzero(smooth)
+        middle = (_BLOCK - 1) / 2
+        blocks = [*means, i * float(_BLOCK) + middle, j * float(_BLOCK) + middle, np.full(len(i), float(_BLOCK**2))]
+    i, j = np.nonzero(single)
+    pixels = [*(p[single] for p in planes), i.astype(float), j.astype(float), np.ones(len(i))]
+    table = np.array(pixels, float)
+    if blocks:
+        table = np.concatenate([table, np.array(blocks, float)], axis=1)
+    return _Samples(np.ascontiguousarray(table[:6].T), *table[6:])
+
+
+def _variance(samples: _Samples, noise: PixelNoise, levels: Levels, errors: ModelErrors) -> FloatArray:
+    light = levels.scale * samples.light
+    relief = levels.scale * errors.relief_px * samples.slope
+    photon = noise.variance(levels.sky + light) / samples.pixels
+    return np.asarray(photon + (errors.texture * light) ** 2 + relief**2)
+
+
+def _design(samples: _Samples, cutout: Cutout, pivot_vu: FloatArray, scale: float, turns: bool) -> FloatArray:
+    """(n, p): the image moved by d is T(x - d), so its derivative is minus the gradient."""
+    _, image, along_v, along_u, night, widening = samples.planes.T
+    v, u = samples.row + cutout.window.v0, samples.col + cutout.window.u0
+    columns = [-scale * along_v, -scale * along_u]
+    if turns:
+        # d(v, u)/d theta = (u, -v) about the pivot.
+        columns.append(-scale * (along_v * (u - pivot_vu[1]) - along_u * (v - pivot_vu[0])))
+    half = max(cutout.window.rows, cutout.window.cols) / 2
+    one = np.ones(len(image))
+    slope_v = (samples.row - cutout.window.rows / 2) / half
+    slope_u = (samples.col - cutout.window.cols / 2) / half
+    return np.stack([*columns, image, night, scale * widening, one, slope_v, slope_u], axis=1)
+
+
+def _solve(
+    samples: _Samples,
+    cutout: Cutout,
+    noise: PixelNoise,
+    levels: Levels,
+    errors: ModelErrors,
+    pivot: FloatArray,
+    context: NavContext,
+) -> _Solution:
+    turns = context.fit_camera_rotation
+    size = 3 if turns else 2
+    design = _design(samples, cutout, pivot, levels.scale, turns)
+    weight = 1.0 / _variance(samples, noise, levels, errors)
+    data, image, night = samples.planes[:, 0], samples.planes[:, 1], samples.planes[:, 4]
+    target = data - levels.sky - levels.scale * image - levels.night * night
+    weighted = design * weight[:, None]
+    gram = weighted.T @ design
+    pull = weighted.T @ target
+    sigma2 = max(float(cutout.sigma_px) ** 2, _LEAST_VARIANCE_PX2)
+    prior = np.zeros(len(gram))
+    prior[size + 1] = 1.0 / (_NIGHT_SHARE * levels.scale) ** 2
+    prior[size + 2] = 1.0 / (_WIDTH_SHARE * sigma2) ** 2
+    prior[size + 4 :] = 1.0 / (_SKY_SLOPE_SHARE * levels.scale) ** 2
+    pull[size + 1] -= prior[size + 1] * levels.night
+    if turns and not _turn_shows(gram, size, context):
+        # Where the image does not show the rotation, it stays.
+        prior[2] = 1e6 * gram[2, 2] + 1e-12
+    gram = gram + np.diag(prior + 1e-12 * np.diag(gram))
+    values = np.linalg.solve(gram, pull)
+    return _Solution(values, gram, design, weight, target - design @ values, size)
+
+
+def _turn_shows(gram: FloatArray, size: int, context: NavContext) -> bool:
+    return settled_information(_marginal(gram, size), context)[1]
+
+
+def _marginal(information: FloatArray, size: int) -> FloatArray:
+    """Information on the first parameters once the others are free."""
+    cross = information[:size, size:]
+    rest = information[size:, size:]
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(rest), 1e-300))
+    inverse = np.linalg.pinv(rest * np.outer(scale, scale), rcond=1e-10) * np.outer(scale, scale)
+    return np.asarray(information[:size, :size] - cross @ inverse @ cross.T)
+
+
+def _look(
+    cutout: Cutout, noise: PixelNoise, levels: Levels, solution: _Solution, options: ModelErrorOptions
+) -> ModelErrors:
+    """Errors of the rendering, from the residuals of all pixels of the cutout after the step."""
+    t, k = cutout.template, solution.size
+    light = levels.scale * t.image
+    model = levels.sky + light + levels.night * t.night
+    moved = solution.values[0] * t.along_v + solution.values[1] * t.along_u
+    model = model - levels.scale * moved + levels.scale * solution.values[k + 2] * t.widening
+    residual = np.where(cutout.good, cutout.data - model, 0.0)
+    excess = residual**2 - noise.variance(levels.sky + light)
+    slope = levels.scale * _slope_length(cutout)
+    return measured_errors(
+        excess, residual, light, slope, cutout.good, assumed_errors(cutout.views, options), options
+    )
+
+
+def _covariance(
+    samples: _Samples, solution: _Solution, noise: PixelNoise, levels: Levels, errors: ModelErrors
+) -> FloatArray:
+    """Covariance of all parameters with the model's errors correlated as they are."""
+    light = levels.scale * samples.planes[:, 1]
+    slope = levels.scale * np.hypot(samples.planes[:, 2], samples.planes[:, 3])
+    photon = noise.variance(levels.sky + light) / samples.pixels
+    weight, design = solution.weight, solution.design
+    total = (design * (weight**2 * photon)[:, None]).T @ design
+    places = (samples.row, samples.col)
+    total += correlated_sums(design, weight * errors.texture * light, places, errors.texture_px)
+    total += correlated_sums(design, weight * errors.relief_px * slope, places, errors.relief_reach_px)
+    inverse = np.linalg.inv(solution.gram)
+    return np.asarray(inverse @ total @ inverse)
+
+
+def _answer(
+    offset: FloatArray,
+    rotation: float,
+    pivot: FloatArray,
+    samples: _Samples,
+    solution: _Solution,
+    cutout: Cutout,
+    noise: PixelNoise,
+    levels: Levels,
+    errors: ModelErrors,
+    context: NavContext,
+) -> TemplateFit | str:
+    size = solution.size
+    full = _covariance(samples, solution, noise, levels, errors)
+    covariance = full[:size, :size]
+    if size == 3 and not _turn_shows(solution.gram, 3, context):
+        covariance = full[:2, :2]
+    if not np.isfinite(covariance).all() or (np.linalg.eigvalsh(covariance) <= 0).any():
+        return "the fit is degenerate"
+    information = np.zeros((size, size))
+    information[: len(covariance), : len(covariance)] = np.linalg.inv(covariance)
+    information, _ = settled_information(information, context)
+    weight, model = solution.weight, levels.scale * samples.planes[:, 1]
+    data = model + solution.residual
+    dm, dd = model - np.average(model, weights=weight), data - np.average(data, weights=weight)
+    power = float(np.sqrt((weight * dm**2).sum() * (weight * dd**2).sum()))
+    return TemplateFit(
+        offset_vu=offset, rotation_rad=rotation, pivot_vu=pivot, information=information, scale_dn=levels.scale,
+        level_dn=levels.sky, night_dn=levels.night, variance_px2=float(solution.values[size + 2]),
+        variance_sigma_px2=float(np.sqrt(max(full[size + 2, size + 2], 0.0))),
+        correlation=float((weight * dm * dd).sum()) / power if power > 0 else 0.0,
+        chi2_per_sample=float((weight * solution.residual**2).mean()), errors=errors, cutout=cutout,
+    )  # fmt: skip
