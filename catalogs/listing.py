@@ -103,7 +103,9 @@ def list_images(archive: Archive, blocks: Mapping[str, InstrumentBlock]) -> list
         found = _by_name(archive, [images] if isinstance(images, str) else images, files)
     known = [(_image_id(entry, archive, files, blocks), entry) for entry in found]
     if select.given():
-        check_selection(select, found[0].row if isinstance(images, IndexRef) else None, archive.url)
+        # A collection's missing members have no row.
+        columns = next((entry.row for entry in found if entry.row), {}) if isinstance(images, IndexRef) else None
+        check_selection(select, columns, archive.url)
         known = [
             (name, entry) for name, entry in known if is_chosen(select, entry.row, entry.path, name, blocks)
         ]  # fmt: skip
