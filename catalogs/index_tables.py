@@ -2,6 +2,7 @@
 
 import csv
 import io
+from collections.abc import Container
 
 from catalogs.instruments import CardValue
 from catalogs.label_text import Keywords, LabelObject, parse_label, parse_pds4
@@ -10,8 +11,10 @@ from pipeline.errors import ConfigurationError
 Row = dict[str, CardValue]
 Spans = list[tuple[int, int]]
 
+_WHOLE, _REAL = ("ASCII_INTEGER", "INTEGER"), ("ASCII_REAL", "REAL", "FLOAT")
 
-def read_pds3_index(table: bytes, label: bytes, name: str) -> list[Row]:
+
+def read_pds3_index(table: bytes, label: bytes, name: str, wanted: Container[str] | None = None) -> list[Row]:
     """Rows of an ASCII table by the columns of its detached label.
 
     Parameters
@@ -20,6 +23,8 @@ def read_pds3_index(table: bytes, label: bytes, name: str) -> list[Row]:
         The two files.
     name
         Of the table, for messages.
+    wanted
+        Columns to keep, all by default: cumulative indexes have a hundred columns and half a million rows.
 
     Returns
     -------
@@ -48,7 +53,8 @@ def read_pds3_index(table: bytes, label: bytes, name: str) -> list[Row]:
     bad = next((number for number, line in enumerate(lines, start=1) if len(line) < shortest), None)
     if bad is not None:
         raise ConfigurationError(f"{name}: row {bad} ends before column {columns[-1][0]}")
-    return [{key: _cell(line, spans, kind) for key, spans, kind in columns} for line in lines]
+    kept = [column for column in columns if wanted is None or column[0] in wanted]
+    return [{key: _cell(line, spans, kind) for key, spans, kind in kept} for line in lines]
 
 
 def _tables(root: LabelObject) -> list[LabelObject]:
@@ -80,11 +86,10 @@ def _column(item: LabelObject, name: str) -> tuple[str, Spans, str]:
 def _cell(line: str, spans: Spans, kind: str) -> CardValue:
     texts = [line[start:end].strip().strip('"').strip() for start, end in spans]
     # Frame counts stand in columns of characters, where a zero at either end counts.
-    convert = {"ASCII_INTEGER": int, "INTEGER": int, "ASCII_REAL": float, "REAL": float, "FLOAT": float}.get(kind)
-    if len(texts) > 1 or convert is None:
+    if len(texts) > 1 or kind not in _WHOLE + _REAL:
         return ",".join(texts)
     try:
-        return convert(texts[0])
+        return int(texts[0]) if kind in _WHOLE else float(texts[0])
     except ValueError:
         return texts[0]
 

@@ -131,6 +131,7 @@ def _value(tokens: list[tuple[str, str]], position: int) -> tuple[CardValue, str
     kind, text = tokens[position]
     if kind == "stop":
         raise ValueError("its label ends inside a keyword")
+    value: CardValue
     if text in ("(", "{") and kind == "mark":
         value, position = _items(tokens, position)
     else:

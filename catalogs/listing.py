@@ -15,7 +15,7 @@ from catalogs.archive import SIDECAR_SUFFIX, Archive, ImageRef, IndexRef, filesy
 from catalogs.images import labelled_file
 from catalogs.index_tables import Row, pds4_product, read_collection, read_pds3_index
 from catalogs.instruments import InstrumentBlock
-from catalogs.selection import check_selection, is_chosen
+from catalogs.selection import check_selection, columns_of, is_chosen
 from catalogs.sidecar import sidecar_image_id
 from pipeline.errors import ConfigurationError
 
@@ -27,6 +27,7 @@ _PIXELS = (".img", ".imq", ".dat", ".fit", ".fits", ".fts", ".qub", ".cub", ".vi
 # Columns that name a row's file: alone, or after the folder.
 _FILE_COLUMNS = ("FILE_SPECIFICATION_NAME", "FILE_NAME")
 _FOLDER_COLUMN = "PATH_NAME"
+_IDENTITY = frozenset((*_FILE_COLUMNS, _FOLDER_COLUMN, "VOLUME_ID", "PRODUCT_ID"))
 
 
 @dataclass(frozen=True)
@@ -98,7 +99,7 @@ def list_images(archive: Archive, blocks: Mapping[str, InstrumentBlock]) -> list
     names = _walk(root or "/", frozenset()) if isinstance(fs, LocalFileSystem) else fs.find(root)
     files = _Files(tuple(sorted(path.removeprefix(root).lstrip("/") for path in names)))
     if isinstance(images, IndexRef):
-        found = _by_index(archive, images.index, files)
+        found = _by_index(archive, images.index, files, columns_of(select, blocks) | _IDENTITY)
     else:
         found = _by_name(archive, [images] if isinstance(images, str) else images, files)
     known = [(_image_id(entry, archive, files, blocks), entry) for entry in found]
@@ -158,7 +159,7 @@ def _labelled(path: str, archive: Archive, files: _Files) -> str | None:
     return files.spelt(beside) or beside
 
 
-def _by_index(archive: Archive, index: str, files: _Files) -> list[_Found]:
+def _by_index(archive: Archive, index: str, files: _Files, columns: frozenset[str]) -> list[_Found]:
     """Images of an index table, whether their files are there or not."""
     path = files.spelt(_inside(index))
     if path is None:
@@ -171,7 +172,7 @@ def _by_index(archive: Archive, index: str, files: _Files) -> list[_Found]:
             labels = files.siblings(path, (".lbl",))
             if not labels:
                 raise ConfigurationError(f"{archive.url}: images.index: {path} has no label {stem(path)}.LBL beside it")
-            rows = read_pds3_index(table, archive.read(labels[0]), path)
+            rows = read_pds3_index(table, archive.read(labels[0]), path, columns)
             found = [_of_row(row, path, archive, files) for row in rows]
     except OSError as error:
         raise ConfigurationError(f"{archive.url}: images.index: {path}: {error.strerror or error}") from error

@@ -109,6 +109,29 @@ def check_selection(selection: Selection, columns: Row | None, source: str) -> N
             raise ConfigurationError(f"{source}: select.{key} cannot be met: there is no column {' or '.join(names)}")
 
 
+def columns_of(selection: Selection, blocks: Mapping[str, InstrumentBlock]) -> frozenset[str]:
+    """Columns of an index that a selection looks at.
+
+    Parameters
+    ----------
+    selection
+        What is wanted.
+    blocks
+        Camera blocks, whose marks tell cameras.
+
+    Returns
+    -------
+    frozenset of str
+        Names in the words of PDS3.
+    """
+    keys = {"start" if key == "stop" else key for key in selection.given()}
+    found = {name for key in keys for name in _COLUMNS.get(key, ())} | {"IMAGE_NUMBER"}
+    if "camera" in keys:
+        marks = [block.identify if isinstance(block.identify, list) else [block.identify] for block in blocks.values()]
+        found |= {name for several in marks for one in several for names in one for name in names.split("|")}
+    return frozenset(found)
+
+
 def is_chosen(selection: Selection, row: Row, path: str, image_id: str, blocks: Mapping[str, InstrumentBlock]) -> bool:
     """Whether an image is wanted.
 

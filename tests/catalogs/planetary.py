@@ -20,7 +20,7 @@ def pds3_label(pointer: str, sample: str, bits: int, shape: tuple[int, int], ext
 def prefixed(pixels: Array, before: int = 0, after: int = 0) -> bytes:
     """Rows with binary prefixes and suffixes that are no pixels."""
     rows = np.ascontiguousarray(pixels).view(np.uint8).reshape(len(pixels), -1)
-    return np.pad(rows, ((0, 0), (before, after)), constant_values=199).tobytes()
+    return bytes(np.pad(rows, ((0, 0), (before, after)), constant_values=199).tobytes())
 
 
 def attached(label: bytes, data: bytes, records: int = 4) -> bytes:
@@ -35,7 +35,7 @@ def vicar(pixels: Array, properties: str = "", prefix: int = 0, header_records: 
     """VICAR file of an image in either byte order."""
     high = pixels.dtype.byteorder == ">"
     rows, columns = pixels.shape
-    record = columns * pixels.dtype.itemsize + prefix
+    record = int(columns * pixels.dtype.itemsize) + prefix
     size = -(-(800 + len(properties)) // record) * record
     label = (
         f"LBLSIZE={size}  FORMAT='{VICAR_FORMATS[pixels.dtype.str[1:]]}'  TYPE='IMAGE'  BUFSIZ={record}  DIM=3  "

@@ -22,9 +22,10 @@ def pixels_of(dtype: str) -> Array:
     """Values that a wrong sign, order or length would change."""
     kind = np.dtype(dtype)
     if kind.kind == "f":
-        return (VALUES * 0.37 - 50.0).astype(dtype)
+        return np.asarray((VALUES * 0.37 - 50.0).astype(dtype))
     span = 2 ** (8 * kind.itemsize) - 3
-    return ((VALUES * (span // VALUES.max() or 1)) % span + (0 if kind.kind == "u" else -(span // 2))).astype(dtype)
+    lowest = 0 if kind.kind == "u" else -(span // 2)
+    return np.asarray(((VALUES * (span // int(VALUES.max()) or 1)) % span + lowest).astype(dtype))
 
 
 def reason_of(data: bytes, name: str = "x.img", companions: dict[str, bytes] | None = None) -> StatusReason:
@@ -93,7 +94,7 @@ def test_missing_and_scaled_pixels() -> None:
     more = f"MISSING_CONSTANT = {missing}\r\nSCALING_FACTOR = 0.5\r\nOFFSET = 3"
     raw = read_image(attached(pds3_label("5", "MSB_INTEGER", 16, SHAPE, more=more), prefixed(pixels)), "x")
     assert np.isnan(raw.pixels[7, 9])
-    expected = np.where(pixels == missing, np.nan, pixels * 0.5 + 3)
+    expected = np.where(pixels == missing, np.nan, pixels.astype(float) * 0.5 + 3)
     assert np.array_equal(raw.pixels, expected.astype("f4"), equal_nan=True)
     unused = pds3_label("5", "MSB_INTEGER", 16, SHAPE, more="MISSING_CONSTANT = -32768\r\nSCALING_FACTOR = 'N/A'")
     whole = read_image(attached(unused, prefixed(pixels_of(">i2"))), "x").pixels
@@ -150,7 +151,7 @@ def test_pds4_scales() -> None:
         "a.img", "SignedMSB2", SHAPE, element="<scaling_factor>0.25</scaling_factor><value_offset>-2</value_offset>"
     )
     raw = read_image(pixels_of(">i2").tobytes(), "a.img", {"a.xml": label})
-    assert np.array_equal(raw.pixels, (pixels_of(">i2") * 0.25 - 2).astype("f4"))
+    assert np.array_equal(raw.pixels, (pixels_of(">i2").astype(float) * 0.25 - 2).astype("f4"))
 
 
 def isis(pixels: Array, **options: object) -> bytes:
