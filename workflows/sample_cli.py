@@ -43,7 +43,7 @@ def flyby(
     directory: Annotated[Path, typer.Argument(help="New or empty folder.")],
     frames: Annotated[int, typer.Option(min=1, help="Images to make.")] = 24,
     seed: Annotated[int, typer.Option(min=0, help="Same seed, same bytes.")] = 1,
-    largest: Annotated[float, typer.Option(min=6.0, max=10000.0, help="Largest diameter of a target, pixels.")] = 3000.0,
+    largest: Annotated[float, typer.Option(min=6.0, max=10000.0, help="Largest target, pixels across.")] = 3000.0,
     haze: Annotated[float, typer.Option(min=0.0, max=500.0, help="Scale height of the planet's air, km.")] = 0.0,
     stars: Annotated[float, typer.Option(min=0.0, max=1.0, help="Share of images with stars.")] = 0.2,
     traps: Annotated[bool, typer.Option("--traps", help="Only scenes of which something wrong is told.")] = False,
