@@ -12,6 +12,7 @@ from posixpath import basename, dirname
 
 import cv2
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from catalogs.archive import SIDECAR_SUFFIX, STARS_SUFFIX, Archive, ImageRef, file_stamp, stem
 from catalogs.bodies import BodyModels
@@ -182,6 +183,8 @@ class ImageRunner:
     def __init__(self, setup: Setup) -> None:
         # Workers are processes of one thread each; OpenCV would otherwise start one per core in every worker.
         cv2.setNumThreads(1)
+        # The same for linear algebra, whose sums also come out differently with more threads.
+        threadpool_limits(1)
         self._setup = setup
         self._indexes = [open_index(path) for path in setup.star_indexes]
         self._options = setup.configuration.navigation()

@@ -10,7 +10,8 @@ from pipeline.records import BoolArray, FloatArray, Image
 # Immerkaer 1996: this filter is blind to planes and has a norm of six.
 _LAPLACIAN = np.array([[1.0, -2.0, 1.0], [-2.0, 4.0, -2.0], [1.0, -2.0, 1.0]]) / 6.0
 _TILE = 16
-_MAD_TO_SIGMA = 1.4826
+# Standard deviation over mean absolute value of a normal variable.
+_MEAN_TO_SIGMA = 1.2533
 # Levels are binned so that each bin's noise is a quantile over many tiles: texture only ever adds to it.
 _BINS = 12
 _QUIET_QUANTILE = 0.3
@@ -80,13 +81,13 @@ def _tiles(image: Image, bad: BoolArray) -> tuple[FloatArray, FloatArray]:
     rows, cols = (n // _TILE * _TILE for n in image.shape)
     if not rows or not cols:
         return np.zeros(0), np.zeros(0)
-    rough = cv2.filter2D(image, cv2.CV_32F, _LAPLACIAN)[:rows, :cols]
-    shape = (rows // _TILE, _TILE, cols // _TILE, _TILE)
-    touched = cv2.dilate(bad.astype(np.uint8), np.ones((3, 3), np.uint8))[:rows, :cols]
-    clean = ~(touched.reshape(shape).any(axis=(1, 3)))
-    level = image[:rows, :cols].reshape(shape).mean(axis=(1, 3))[clean].astype(float)
-    spread = np.abs(rough).reshape(shape).transpose(0, 2, 1, 3).reshape(*clean.shape, -1)[clean]
-    variance = (_MAD_TO_SIGMA * np.median(spread, axis=1).astype(float)) ** 2 if len(level) else np.zeros(0)
+    size = (cols // _TILE, rows // _TILE)
+    rough = np.abs(cv2.filter2D(image, cv2.CV_32F, _LAPLACIAN))[:rows, :cols]
+    touched = cv2.dilate(bad.astype(np.uint8), np.ones((3, 3), np.uint8))[:rows, :cols].astype(np.float32)
+    means = [cv2.resize(plane, size, interpolation=cv2.INTER_AREA) for plane in (image[:rows, :cols], rough, touched)]
+    clean = means[2] == 0
+    level, spread = (plane[clean].astype(float) for plane in means[:2])
+    variance = (_MEAN_TO_SIGMA * spread) ** 2
     return _quiet(level, variance)
 
 

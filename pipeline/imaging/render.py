@@ -23,6 +23,8 @@ RAY_SPACING_PX = 16
 _LIMB_SAMPLES = 5
 # Below this core, in cells, a sampled Gaussian no longer stands for a continuous one (error 0.3 % at 0.54).
 _LEAST_SIGMA_CELLS = 0.5
+# Below this diameter the limb has too few pixels for the errors of sampling to average out.
+_SMALL_PX = 150.0
 
 
 @dataclass(frozen=True)
@@ -157,7 +159,29 @@ def _in_shadow(px, py, pz, sun, occluders):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def _draw(cells, cover, slopes, origin, over, inner, centre, form, sun, law, parameter, brightness, occluders):  # type: ignore[no-untyped-def]
+def _shade(ex, ey, disc, cx, cy, cz, bc, cbc, form, sun, law, parameter, occluders):  # type: ignore[no-untyped-def]
+    """Radiance where a ray d = centre/z + e meets the body."""
+    bex = form[0, 0] * ex + form[0, 1] * ey
+    bey = form[1, 0] * ex + form[1, 1] * ey
+    bez = form[2, 0] * ex + form[2, 1] * ey
+    dbd = cbc / (cz * cz) + 2.0 * (ex * bc[0] + ey * bc[1]) / cz + ex * bex + ey * bey
+    t = (cbc / cz + ex * bc[0] + ey * bc[1] - sqrt(disc)) / dbd
+    # Normal B (t d - c) with d = c/z + e.
+    f = t / cz - 1.0
+    nx, ny, nz = f * bc[0] + t * bex, f * bc[1] + t * bey, f * bc[2] + t * bez
+    norm = 1.0 / sqrt(nx * nx + ny * ny + nz * nz)
+    mu0 = (nx * sun[0] + ny * sun[1] + nz * sun[2]) * norm
+    if mu0 <= 0.0:
+        return 0.0
+    rx, ry = cx + ex, cy + ey
+    if occluders.shape[0] and _in_shadow(t * rx, t * ry, t, sun, occluders):
+        return 0.0
+    mu = -(nx * rx + ny * ry + nz) * norm / sqrt(rx * rx + ry * ry + 1.0)
+    return reflectance(law, parameter, mu0, mu)
+
+
+@numba.njit(cache=True, nogil=True)
+def _draw(cells, cover, slopes, over, inner, centre, form, sun, law, parameter, brightness, occluders):  # type: ignore[no-untyped-def]
     """Add one solid to the cells, in front of what they hold.
 
     The ray is written d = centre/z + e: then ``disc = cBc/z^2 + 2 e.Bc/z + (e.Bc)^2 - (cBc - 1) eBe`` has no
@@ -169,63 +193,51 @@ def _draw(cells, cover, slopes, origin, over, inner, centre, form, sun, law, par
     cx, cy = centre[0] / cz, centre[1] / cz
     rows, cols = cells.shape
     size = 1.0 / over
+    step = size / RAY_SPACING_PX
+    k0, kx, ky = cbc / (cz * cz), 2.0 * bc[0] / cz, 2.0 * bc[1] / cz
+    q = cbc - 1.0
+    mxx, mxy, myy = bc[0] ** 2 - q * form[0, 0], bc[0] * bc[1] - q * form[0, 1], bc[1] ** 2 - q * form[1, 1]
     for i in range(rows):
-        v_cell = (i + 0.5) * size - 0.5
+        gv = ((i + 0.5) * size - 0.5) / RAY_SPACING_PX + 1.0
+        a = int(gv)
+        fv = gv - a
+        last = -1
         for j in range(cols):
-            u_cell = (j + 0.5) * size - 0.5
-            gv = (v_cell + origin) / RAY_SPACING_PX
-            gu = (u_cell + origin) / RAY_SPACING_PX
-            a, b = int(gv), int(gu)
-            fv, fu = gv - a, gu - b
-            x00, x01, x10, x11 = slopes[a, b, 0], slopes[a, b + 1, 0], slopes[a + 1, b, 0], slopes[a + 1, b + 1, 0]
-            y00, y01, y10, y11 = slopes[a, b, 1], slopes[a, b + 1, 1], slopes[a + 1, b, 1], slopes[a + 1, b + 1, 1]
-            # Slopes are linear inside a patch: value and derivatives per pixel.
-            xv = ((x10 - x00) * (1 - fu) + (x11 - x01) * fu) / RAY_SPACING_PX
-            xu = ((x01 - x00) * (1 - fv) + (x11 - x10) * fv) / RAY_SPACING_PX
-            yv = ((y10 - y00) * (1 - fu) + (y11 - y01) * fu) / RAY_SPACING_PX
-            yu = ((y01 - y00) * (1 - fv) + (y11 - y10) * fv) / RAY_SPACING_PX
-            x = (x00 * (1 - fu) + x01 * fu) * (1 - fv) + (x10 * (1 - fu) + x11 * fu) * fv - cx
-            y = (y00 * (1 - fu) + y01 * fu) * (1 - fv) + (y10 * (1 - fu) + y11 * fu) * fv - cy
-            if not (x == x and y == y):
-                continue
-            ebc = x * bc[0] + y * bc[1]
-            bex, bey = form[0, 0] * x + form[0, 1] * y, form[1, 0] * x + form[1, 1] * y
-            disc = cbc / (cz * cz) + 2.0 * ebc / cz + ebc * ebc - (cbc - 1.0) * (x * bex + y * bey)
-            dx = 2.0 * (bc[0] / cz + ebc * bc[0] - (cbc - 1.0) * bex)
-            dy = 2.0 * (bc[1] / cz + ebc * bc[1] - (cbc - 1.0) * bey)
-            slope = abs(dx * xv + dy * yv) + abs(dx * xu + dy * yu)
+            gu = ((j + 0.5) * size - 0.5) / RAY_SPACING_PX + 1.0
+            b = int(gu)
+            if b != last:
+                # Slopes are linear inside a patch: value at its left border and derivatives per spacing.
+                last = b
+                x00, x01, x10, x11 = slopes[a, b, 0], slopes[a, b + 1, 0], slopes[a + 1, b, 0], slopes[a + 1, b + 1, 0]
+                y00, y01, y10, y11 = slopes[a, b, 1], slopes[a, b + 1, 1], slopes[a + 1, b, 1], slopes[a + 1, b + 1, 1]
+                x0, y0 = x00 + (x10 - x00) * fv - cx, y00 + (y10 - y00) * fv - cy
+                xu, yu = (x01 - x00) * (1 - fv) + (x11 - x10) * fv, (y01 - y00) * (1 - fv) + (y11 - y10) * fv
+                fu = gu - b
+                xv, yv = (x10 - x00) * (1 - fu) + (x11 - x01) * fu, (y10 - y00) * (1 - fu) + (y11 - y01) * fu
+            x, y = x0 + xu * (gu - b), y0 + yu * (gu - b)
+            disc = k0 + x * (kx + mxx * x + 2.0 * mxy * y) + y * (ky + myy * y)
+            dx, dy = kx + 2.0 * (mxx * x + mxy * y), ky + 2.0 * (mxy * x + myy * y)
             # The cell's corner is half a cell from its centre along each axis; curvature is granted as much again.
-            if disc < -1.1 * size * slope:
+            reach = 1.1 * step * (abs(dx * xv + dy * yv) + abs(dx * xu + dy * yu))
+            if not disc >= -reach:
                 continue
-            samples = inner if disc > 1.1 * size * slope else _LIMB_SAMPLES
+            if disc > reach and inner == 1:
+                light = _shade(x, y, disc, cx, cy, cz, bc, cbc, form, sun, law, parameter, occluders)
+                cells[i, j] = brightness * light
+                cover[i, j] = 1.0
+                continue
+            samples = inner if disc > reach else _LIMB_SAMPLES
             light, covered = 0.0, 0
-            for p in range(samples):
-                ov = ((p + 0.5) / samples - 0.5) * size
-                for q in range(samples):
-                    ou = ((q + 0.5) / samples - 0.5) * size
+            for m in range(samples):
+                ov = ((m + 0.5) / samples - 0.5) * step
+                for n in range(samples):
+                    ou = ((n + 0.5) / samples - 0.5) * step
                     ex, ey = x + xv * ov + xu * ou, y + yv * ov + yu * ou
-                    ebc = ex * bc[0] + ey * bc[1]
-                    bex = form[0, 0] * ex + form[0, 1] * ey
-                    bey = form[1, 0] * ex + form[1, 1] * ey
-                    disc_here = cbc / (cz * cz) + 2.0 * ebc / cz + ebc * ebc - (cbc - 1.0) * (ex * bex + ey * bey)
+                    disc_here = k0 + ex * (kx + mxx * ex + 2.0 * mxy * ey) + ey * (ky + myy * ey)
                     if disc_here < 0.0:
                         continue
                     covered += 1
-                    bez = form[2, 0] * ex + form[2, 1] * ey
-                    dbd = cbc / (cz * cz) + 2.0 * ebc / cz + ex * bex + ey * bey
-                    t = (cbc / cz + ebc - sqrt(disc_here)) / dbd
-                    # Normal B (t d - c) with d = c/z + e.
-                    f = t / cz - 1.0
-                    nx, ny, nz = f * bc[0] + t * bex, f * bc[1] + t * bey, f * bc[2] + t * bez
-                    norm = 1.0 / sqrt(nx * nx + ny * ny + nz * nz)
-                    mu0 = (nx * sun[0] + ny * sun[1] + nz * sun[2]) * norm
-                    if mu0 <= 0.0:
-                        continue
-                    rx, ry = cx + ex, cy + ey
-                    mu = -(nx * rx + ny * ry + nz) * norm / sqrt(rx * rx + ry * ry + 1.0)
-                    if occluders.shape[0] and _in_shadow(t * rx, t * ry, t, sun, occluders):
-                        continue
-                    light += reflectance(law, parameter, mu0, mu)
+                    light += _shade(ex, ey, disc_here, cx, cy, cz, bc, cbc, form, sun, law, parameter, occluders)
             if covered:
                 total = samples * samples
                 cells[i, j] = brightness * light / total + (1.0 - covered / total) * cells[i, j]
@@ -248,7 +260,7 @@ def cells_per_pixel(sigma_px: float, diameter_px: float) -> int:
         Cells along a pixel's side.
     """
     need = ceil(_LEAST_SIGMA_CELLS / sigma_px)
-    return max(need, 2 if diameter_px < 500.0 else 1)
+    return max(need, 2 if diameter_px < _SMALL_PX else 1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -304,8 +316,8 @@ def render_cells(
         over = cells.over
         inside = np.s_[rows.start * over : rows.stop * over, cols.start * over : cols.stop * over]
         _draw(
-            cells.light[inside], cells.cover[inside], _grid_for(rays, part), float(RAY_SPACING_PX), over, inner, solid.centre_km, solid.form, solid.sun,
-            solid.law, solid.parameter, solid.brightness, solid.shadowed_by,
+            cells.light[inside], cells.cover[inside], _grid_for(rays, part), over, inner, solid.centre_km, solid.form,
+            solid.sun, solid.law, solid.parameter, solid.brightness, solid.shadowed_by,
         )  # fmt: skip
 
 

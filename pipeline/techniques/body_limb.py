@@ -42,6 +42,7 @@ _SETTLED_PX = 0.02
 # Spacing at which vertices tell something new about whether the line is there at all.
 _INDEPENDENT_PX = 4.0
 _RIVAL_PX = 6.0
+_REACH_PX = 8.0
 
 
 class BodyLimbOptions(TechniqueOptions):
@@ -191,14 +192,21 @@ def _find_limb(scene: BodyScene, frame: Frame, context: NavContext, options: Bod
     if np.count_nonzero(near) < 8:
         return "no lit limb can come into the frame"
     places, normals = places[near], normals[near]
-    noise = np.sqrt(frame.noise.variance(frame.raw)).astype(np.float32)
-    scale = max(1.0, scene.sigma_px)
-    field = edge_field(frame.raw, frame.bad, noise, scale)
     pivot = places.mean(axis=0)
     arm = np.abs(pivot - camera.centre_vu)
     turn = context.max_rotation_rad
     margin = context.search_margin_vu
     limits = (margin[0] + turn * arm[1], margin[1] + turn * arm[0])
+    # Only what the limb can reach is looked at; the corner of that part is the origin of all places below.
+    low = np.clip(np.floor(places.min(axis=0) - limits - _REACH_PX), 0, None).astype(int)
+    high = np.clip(np.ceil(places.max(axis=0) + limits + _REACH_PX), 0, camera.shape_vu).astype(int)
+    part = np.s_[low[0] : high[0], low[1] : high[1]]
+    raw, bad = frame.raw[part], frame.bad[part]
+    if min(raw.shape) < 8:
+        return "no lit limb can come into the frame"
+    noise = np.sqrt(frame.noise.variance(raw)).astype(np.float32)
+    field = edge_field(raw, bad, noise, max(1.0, scene.sigma_px))
+    places, pivot = places - low, pivot - low
     found = search_line(field, places, normals, np.ones(len(places)), limits, turn, pivot)
     if not found or found[0].score < options.min_score:
         return f"edges agree with the limb by {found[0].score if found else 0.0:.2f}"
@@ -212,7 +220,7 @@ def _find_limb(scene: BodyScene, frame: Frame, context: NavContext, options: Bod
     offset, rotation = refined.offset_vu, refined.rotation_rad
     if np.abs(offset - best.offset_vu).max() > _RIVAL_PX or abs(rotation) > 1.2 * turn:
         offset, rotation = np.array(best.offset_vu), best.rotation_rad
-    centre, theta = compose(context, np.zeros(2), 0.0, pivot, np.array([*offset, rotation]))
+    centre, theta = compose(context, np.zeros(2), 0.0, pivot + low, np.array([*offset, rotation]))
     return _Start(centre, theta, confidence, best.score)
 
 

@@ -6,6 +6,7 @@ field of long wavelength stands for an altogether wrong shape, and a common heig
 or a hazy limb.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -200,16 +201,34 @@ def _likeliest(
     long_prior = np.where(_LONG_FACTORS > 0, present - np.log(len(_LONG_FACTORS) - 1), absent)
     short, long_ = start
     for _ in range(2):
-        scores = [
-            _restricted_likelihood(shift, design, base + f**2 * near + long_**2 * far) + p
-            for f, p in zip(_FACTORS, prior, strict=True)
-        ]
-        short = float(_FACTORS[int(np.argmax(scores))])
-        scores = [
-            _restricted_likelihood(shift, design, base + short**2 * near + g**2 * far) + p
-            for g, p in zip(_LONG_FACTORS, long_prior, strict=True)
-        ]
-        previous, long_ = long_, float(_LONG_FACTORS[int(np.argmax(scores))])
+        short = _climb(
+            _FACTORS, short,
+            lambda k: prior[k]
+            + _restricted_likelihood(shift, design, base + _FACTORS[k] ** 2 * near + long_**2 * far),
+        )  # fmt: skip
+        previous = long_
+        long_ = _climb(
+            _LONG_FACTORS, long_,
+            lambda k: long_prior[k]
+            + _restricted_likelihood(shift, design, base + short**2 * near + _LONG_FACTORS[k] ** 2 * far),
+        )  # fmt: skip
         if long_ == previous:
             break
     return short, long_
+
+
+def _climb(grid: FloatArray, start: float, score: Callable[[int], float]) -> float:
+    """Highest point of a grid, uphill from the nearest one; two steps further are looked at, over a small dip."""
+    known: dict[int, float] = {}
+
+    def at(k: int) -> float:
+        if k not in known:
+            known[k] = score(k) if 0 <= k < len(grid) else -np.inf
+        return known[k]
+
+    here = int(np.argmin(np.abs(grid - start)))
+    while True:
+        best = max((here - 2, here - 1, here, here + 1, here + 2), key=at)
+        if best == here:
+            return float(grid[here])
+        here = best

@@ -304,17 +304,18 @@ def _look(
 def _covariance(
     samples: _Samples, solution: _Solution, noise: PixelNoise, levels: Levels, errors: ModelErrors
 ) -> FloatArray:
-    """Covariance of all parameters with the model's errors correlated as they are."""
+    """Covariance of offset, rotation and point spread with the model's errors correlated as they are."""
     light = levels.scale * samples.planes[:, 1]
     slope = levels.scale * np.hypot(samples.planes[:, 2], samples.planes[:, 3])
     photon = noise.variance(levels.sky + light) / samples.pixels
-    weight, design = solution.weight, solution.design
-    total = (design * (weight**2 * photon)[:, None]).T @ design
+    wanted = [*range(solution.size), solution.size + 2]
+    # What each sample's residual adds to the wanted parameters.
+    influence = (solution.design @ np.linalg.inv(solution.gram)[:, wanted]) * solution.weight[:, None]
+    total = (influence * photon[:, None]).T @ influence
     places = (samples.row, samples.col)
-    total += correlated_sums(design, weight * errors.texture * light, places, errors.texture_px)
-    total += correlated_sums(design, weight * errors.relief_px * slope, places, errors.relief_reach_px)
-    inverse = np.linalg.inv(solution.gram)
-    return np.asarray(inverse @ total @ inverse)
+    total += correlated_sums(influence, errors.texture * light, places, errors.texture_px)
+    total += correlated_sums(influence, errors.relief_px * slope, places, errors.relief_reach_px)
+    return np.asarray(total)
 
 
 def _answer(
@@ -340,13 +341,16 @@ def _answer(
     information[: len(covariance), : len(covariance)] = np.linalg.inv(covariance)
     information, _ = settled_information(information, context)
     weight, model = solution.weight, levels.scale * samples.planes[:, 1]
+    chi2 = float((weight * solution.residual**2).mean())
+    # A rendering that fits worse than all that was granted to it is as much less certain (Birge 1932).
+    information = information / max(chi2, 1.0)
     data = model + solution.residual
     dm, dd = model - np.average(model, weights=weight), data - np.average(data, weights=weight)
     power = float(np.sqrt((weight * dm**2).sum() * (weight * dd**2).sum()))
     return TemplateFit(
         offset_vu=offset, rotation_rad=rotation, pivot_vu=pivot, information=information, scale_dn=levels.scale,
         level_dn=levels.sky, night_dn=levels.night, variance_px2=float(solution.values[size + 2]),
-        variance_sigma_px2=float(np.sqrt(max(full[size + 2, size + 2], 0.0))),
+        variance_sigma_px2=float(np.sqrt(max(full[size, size], 0.0))),
         correlation=float((weight * dm * dd).sum()) / power if power > 0 else 0.0,
-        chi2_per_sample=float((weight * solution.residual**2).mean()), errors=errors, cutout=cutout,
+        chi2_per_sample=chi2, errors=errors, cutout=cutout,
     )  # fmt: skip
