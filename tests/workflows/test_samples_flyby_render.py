@@ -14,10 +14,10 @@ from workflows.samples.attitude import looking_at
 from workflows.samples.cameras import SampleCamera, project, unproject
 from workflows.samples.flyby_bodies import Scenery, prepare
 from workflows.samples.flyby_cameras import flyby_cameras
-from workflows.samples.flyby_rays import SILHOUETTE
+from workflows.samples.flyby_rays import PAD, SILHOUETTE, STEP_DEG, axes_of_sight, trace_silhouette
 from workflows.samples.flyby_render import Light, core_kernels, gather_light
 from workflows.samples.flyby_system import SampleBody, Sighting, Surface, body_named
-from workflows.samples.flyby_terrain import PAD, STEP_DEG, Terrain, lumpy, random_field, smooth_terrain, terrain_of
+from workflows.samples.flyby_terrain import Terrain, lumpy, random_field, smooth_terrain, terrain_of
 from workflows.samples.flyby_truth import cramer_rao
 
 Floats = NDArray[np.float64]
@@ -76,7 +76,7 @@ def test_the_limb_lies_where_the_cone_of_tangents_meets_the_array(
     image = _light(optics, sighting, attitude, smooth_terrain()).total
     limb = _limb_polygon(optics, sighting, attitude)
     middle = limb.mean(axis=0)
-    v, u = np.indices(image.shape)
+    v, u = np.mgrid[: image.shape[0], : image.shape[1]]
     near = np.abs(np.hypot(v - middle[0], u - middle[1]) - radius) < 4.0
     pixels = np.stack([v[near], u[near]], axis=1).astype(float)
     outward = limb - middle
@@ -187,6 +187,10 @@ def test_heights_have_the_rms_and_the_correlation_that_is_told() -> None:
     terrain = terrain_of(body_named("CORVETH"), 3)
     heights = terrain.heights[PAD:-PAD, PAD:-PAD].astype(float)
     weight = np.cos(np.radians(np.linspace(-90.0, 90.0, len(heights))))[:, None]
+    mean = (heights * weight).sum() / weight.sum() / heights.shape[1]
+    # Limbs, not the mean surface, stand at the told radii.
+    assert -0.6 * terrain.rms < mean < 0.3 * terrain.rms
+    heights -= mean
     assert np.sqrt((heights**2 * weight).sum() / weight.sum() / heights.shape[1]) == pytest.approx(
         terrain.rms, rel=1e-3
     )
@@ -237,6 +241,19 @@ def test_the_silhouette_is_the_outermost_line_that_touches_the_relief() -> None:
         assert spheres.silhouette[0, k + 1] == pytest.approx(top, rel=5e-6)
 
 
+def test_limbs_scatter_about_the_told_radii() -> None:
+    body = body_named("FENWYCK")
+    lifts = []
+    for seed in range(3):
+        terrain = terrain_of(body, seed)
+        for way in np.random.default_rng(seed + 50).standard_normal((10, 3)):
+            eye = 200.0 * way / np.linalg.norm(way)
+            edge = trace_silhouette(eye, axes_of_sight(eye), terrain.heights, terrain.highest)
+            lifts.append((200.0 * np.sin(edge).mean() - 1.0) / terrain.rms)
+    # Thirty limbs whose means scatter by a sixth of the rms; the mean surface lies a third of it lower.
+    assert abs(np.mean(lifts)) < 0.12
+
+
 def test_relief_shows_at_the_limb_and_lumps_more() -> None:
     body = body_named("FENWYCK")
     terrain = terrain_of(body, 3)
@@ -254,7 +271,7 @@ def test_relief_shows_at_the_limb_and_lumps_more() -> None:
 def test_a_nearer_body_hides_and_a_sunward_one_shades() -> None:
     optics, ball = SMALL, _ball(law="lommel_seeliger")
     behind, attitude = _seen(optics, ball, 20.0, (47.5, 47.5), 0.0)
-    ahead = behind.place_km / behind.range_km
+    ahead = behind.place_km / np.linalg.norm(behind.place_km)
     front = replace(behind, body=replace(ball, name="FRONT"), place_km=behind.place_km - 4000.0 * ahead)
     dark = replace(front, sun=ahead)
     spheres = prepare(

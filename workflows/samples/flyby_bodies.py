@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from workflows.samples.cameras import FloatArray, SampleCamera, project
-from workflows.samples.flyby_rays import HAZE_HEIGHTS, LAWS, Spheres, trace_silhouette
+from workflows.samples.flyby_rays import HAZE_HEIGHTS, LAWS, Spheres, axes_of_sight, trace_silhouette
 from workflows.samples.flyby_system import Sighting
 from workflows.samples.flyby_terrain import Terrain
 
@@ -31,15 +31,6 @@ def _scaled_from_j2000(sighting: Sighting) -> FloatArray:
     """Return the matrix (3, 3) from J2000 km to a body's scaled axes."""
     scaled: FloatArray = sighting.from_j2000 / np.array(sighting.body.radii_km)[:, None]
     return scaled
-
-
-def _axes_of_sight(eye: FloatArray) -> FloatArray:
-    """Return rows (3, 3): two directions across the line from an eye to the centre, and the one along it."""
-    ahead = -eye / np.linalg.norm(eye)
-    beside = np.eye(3)[int(np.argmin(np.abs(ahead)))]
-    across = np.cross(beside, ahead)
-    across /= np.linalg.norm(across)
-    return np.stack([across, np.cross(ahead, across), ahead])
 
 
 def shades_of(sighting: Sighting, all_bodies: list[Sighting]) -> list[Sighting]:
@@ -92,7 +83,7 @@ def prepare(
     sightings = [item.sighting for item in scenery]
     matrices = [_scaled_from_j2000(sighting) for sighting in sightings]
     eyes = [-matrix @ sighting.place_km for matrix, sighting in zip(matrices, sightings, strict=True)]
-    axes = [_axes_of_sight(eye) for eye in eyes]
+    axes = [axes_of_sight(eye) for eye in eyes]
     tables = [
         trace_silhouette(eye, ax, item.terrain.heights, item.terrain.highest)
         for eye, ax, item in zip(eyes, axes, scenery, strict=True)

@@ -21,8 +21,7 @@ from workflows.samples.render import add_stars
 from workflows.samples.scene import Sources
 
 FULLEST = 0.9
-"""Share of the full scale that all but the brightest spots of a frame reach at most."""
-BRIGHT_PERCENTILE = 99.8
+"""Share of the full scale that the light of a frame reaches at most, unless it is overexposed."""
 LIT_SHARE = 0.1
 """Pixels of the target brighter than this share of its bright ones are its lit disc."""
 LUMP_RMS = (0.02, 0.04)
@@ -121,9 +120,8 @@ def _level(shot: Shot, light: Light, background_dn: float) -> tuple[float, float
     still = optics.read_noise_dn**2 + background_dn / optics.gain_e_per_dn
     half = shot.snr**2 / (2.0 * optics.gain_e_per_dn)
     wanted = half + np.sqrt(half**2 + shot.snr**2 * still)
-    brightest = float(np.percentile(light.total[light.total > LIT_SHARE * mean], BRIGHT_PERCENTILE))
-    room = FULLEST * optics.saturation_dn - optics.bias_dn - background_dn
-    return min(wanted / mean, room / brightest), mean
+    room = FULLEST * (optics.saturation_dn - optics.bias_dn - background_dn) / float(light.total.max())
+    return room * shot.overexposure if shot.overexposure else min(wanted / mean, room), mean
 
 
 @numba.njit(cache=True)

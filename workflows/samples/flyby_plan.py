@@ -52,6 +52,9 @@ LARGEST_FRAMES = 10.0
 """Largest diameter over the shorter side of the array."""
 TRAP_DIAMETER_PX = (30.0, 500.0)
 TRAP_SNR = 20.0
+OVEREXPOSED_SHARE = 0.03
+OVEREXPOSED = (1.3, 3.0)
+"""How often the brightest light of an overexposed frame fills the scale."""
 TWINS = ("CORVETH", "HALVREN")
 
 
@@ -73,6 +76,8 @@ class Shot:
         Name of the body; ``single``, ``companion``, ``edge`` or one of `TRAPS`.
     snr
         Wanted mean light of the lit disc over the noise of a pixel.
+    overexposure
+        How often the brightest light fills the detector's scale; zero where the wanted signal decides.
     stars
         Whether there are stars.
     """
@@ -92,6 +97,7 @@ class Shot:
     target: str
     kind: str
     snr: float
+    overexposure: float
     stars: bool
     haze_km: float
     smooth: bool
@@ -344,11 +350,17 @@ def plan_shot(index: int, options: FlybyOptions) -> Shot:
         target=wish.target.name,
         kind=wish.kind,
         snr=max(snr, min(TRAP_SNR, options.snr[1])) if trap else snr,
+        overexposure=float(rng.uniform(*OVEREXPOSED)) if _is_overexposed(camera, trap, rng) else 0.0,
         stars=bool(rng.random() < options.star_share),
         haze_km=options.haze_km,
         smooth=options.smooth,
         scale_error=options.scale_error,
     )
+
+
+def _is_overexposed(camera: FlybyCamera, trap: str | None, rng: np.random.Generator) -> bool:
+    """Draw whether a frame saturates; Voyager's corrected products do not tell where they do."""
+    return bool(rng.random() < OVEREXPOSED_SHARE) and camera.stored != "voyager" and trap is None
 
 
 def plan_shots(options: FlybyOptions) -> list[Shot]:

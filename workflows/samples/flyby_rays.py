@@ -15,8 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from workflows.samples.cameras import FloatArray
-from workflows.samples.flyby_terrain import PAD, STEP_DEG, MapArray
 
+MapArray = NDArray[np.float32]
+
+STEP_DEG = 0.25
+"""Cells of the maps of heights and albedo."""
+PAD = 2
+"""Rows and columns of the maps beyond their edges, as cubic interpolation wants them."""
 LAWS = ("lambert", "lommel_seeliger", "lunar_lambert")
 SILHOUETTE = 2048
 """Position angles of a table, 0.18 deg apart: eleven to the shortest wavelength of the heights."""
@@ -170,6 +175,15 @@ def look_up_slope(field, x, y, z):  # type: ignore[no-untyped-def]
         east += wr[a] * slope
     scale = 180.0 / np.pi / STEP_DEG
     return north * scale, east * scale / max(cosine, 2e-3)
+
+
+def axes_of_sight(eye: FloatArray) -> FloatArray:
+    """Return rows (3, 3): two directions across the line from an eye to the centre, and the one along it."""
+    ahead = -eye / np.linalg.norm(eye)
+    beside = np.eye(3)[int(np.argmin(np.abs(ahead)))]
+    across = np.cross(beside, ahead)
+    across /= np.linalg.norm(across)
+    return np.stack([across, np.cross(ahead, across), ahead])
 
 
 @numba.njit(cache=True)

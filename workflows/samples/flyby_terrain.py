@@ -11,18 +11,13 @@ from functools import lru_cache
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import eval_legendre, expit
 
 from workflows.samples.cameras import FloatArray
+from workflows.samples.flyby_rays import PAD, STEP_DEG, MapArray, axes_of_sight, trace_silhouette
 from workflows.samples.flyby_system import SampleBody
 
-MapArray = NDArray[np.float32]
-
-STEP_DEG = 0.25
 ROWS, COLUMNS = round(180 / STEP_DEG) + 1, round(360 / STEP_DEG)
-PAD = 2
-"""Rows and columns beyond the edges, as cubic interpolation wants them."""
 HIGHEST_DEGREE = 180
 """Shortest wavelength 2 deg, eight cells of the map."""
 ALBEDO_DEGREES = (2, 120)
@@ -30,6 +25,9 @@ ALBEDO_SLOPE = 1.3
 DARKEST = 0.25
 """Lowest relative albedo."""
 LUMP_DEGREES = (2, 5)
+LIMB_VIEWS = 6
+FAR = 300.0
+"""Distance, in radii, from which limbs are looked at."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +43,8 @@ class Terrain:
     highest
         Largest height.
     rms, correlation_deg
-        Of the heights: their rms over the sphere, and the angle at which their autocovariance has fallen to 1/e.
+        Of the heights: their rms about their mean over the sphere, and the angle at which their autocovariance has
+        fallen to 1/e.
     """
 
     heights: MapArray
@@ -156,16 +155,29 @@ def _albedo(body: SampleBody, rng: np.random.Generator) -> MapArray:
     return padded(np.maximum(1.0 + body.surface.albedo_rms * (field - mean) / rms, DARKEST))
 
 
+def limb_lift(heights: MapArray, highest: float, rng: np.random.Generator) -> float:
+    """Return by how much limbs stand above the surface's mean, over the radius.
+
+    A limb is the outermost of all that is near it, so ellipsoids that are fitted to limbs, as the radii of real bodies
+    are, lie above the mean surface by up to a third of the rms.
+    """
+    lifts = []
+    for way in rng.standard_normal((LIMB_VIEWS, 3)):
+        eye = FAR * way / np.linalg.norm(way)
+        lifts.append(FAR * np.sin(trace_silhouette(eye, axes_of_sight(eye), heights, highest)).mean() - 1.0)
+    return float(np.mean(lifts))
+
+
 @lru_cache(maxsize=16)
 def terrain_of(body: SampleBody, seed: int) -> Terrain:
-    """Return the terrain of a body; the same seed gives the same."""
+    """Return the terrain of a body, its radii being those of limbs; the same seed gives the same."""
     rng = np.random.default_rng([seed, body.naif_id, 11])
     surface = body.surface
     field, variance = random_field((surface.lowest_degree, HIGHEST_DEGREE), surface.slope, rng)
-    heights = surface.roughness * field
-    return Terrain(
-        padded(heights), _albedo(body, rng), float(heights.max()), surface.roughness, correlation_angle_deg(variance)
-    )
+    heights, highest = padded(surface.roughness * field), float(surface.roughness * field.max())
+    lift = limb_lift(heights, highest, rng)
+    correlation = round(correlation_angle_deg(variance), 3)
+    return Terrain(heights - np.float32(lift), _albedo(body, rng), highest - lift, surface.roughness, correlation)
 
 
 def lumpy(terrain: Terrain, rms: float, rng: np.random.Generator) -> Terrain:

@@ -118,6 +118,7 @@ def truth_entry(shot: Shot, scene: Scene, taken: Taken) -> Json:
         "n_stars": scene.n_stars,
         "exposure_s": shot.exposure_s,
         "missing_lines": taken.missing_lines,
+        "overexposure": round(shot.overexposure, 3),
         "useless_px": int(taken.useless.sum()),
         "true_camera_from_j2000_wxyz": [float(x) for x in wxyz_from_matrix(shot.truth)],
     }
