@@ -46,7 +46,12 @@ class ArchiveDescription(Options):
         description="glob relative to the root, a list of globs and paths, or an index table"
     )
     select: Selection = Field(default=Selection(), description="which of the images are wanted")
-    geometry: Literal["auto", "header", "sidecar"] = Field("auto", description="auto: a sidecar where there is one")
+    geometry: Literal["auto", "header", "sidecar", "spice"] = Field(
+        "auto", description="auto: a sidecar where there is one, else kernels where there are any, else the header"
+    )
+    kernels: str | list[str] = Field(
+        default_factory=list, description="SPICE meta-kernels or kernels, relative to the root, local files only"
+    )
     instrument: str | None = Field(None, description="a camera block; by default the header is recognised")
     stars: str | list[str | StarTableRef] = Field("per-image", description="built-in names, tables, or per-image")
     settings: dict[str, object] = Field(default_factory=dict, description="instrument settings that win")

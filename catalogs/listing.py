@@ -246,7 +246,7 @@ def _matcher(pattern: str) -> Callable[[str], object]:
 def _image_id(entry: _Found, archive: Archive, files: _Files, blocks: Mapping[str, InstrumentBlock]) -> str:
     """The sidecar's claim, else a product id that the file's name is, else the index's, else the relative path."""
     sidecar = stem(entry.path) + SIDECAR_SUFFIX
-    if archive.description.geometry != "header" and sidecar in files.known:
+    if archive.description.geometry in ("auto", "sidecar") and sidecar in files.known:
         claimed = _claimed_id(archive, sidecar)
         if claimed is not None:
             return _safe(claimed)

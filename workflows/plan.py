@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
@@ -22,7 +23,9 @@ from catalogs.archive import (
 )
 from catalogs.bodies import BodyBlock, merged_blocks
 from catalogs.geometry import first_problem
+from catalogs.kernels import Kernel, check_kernels
 from catalogs.listing import list_images
+from catalogs.spice import focal_length_notes
 from catalogs.star_sources import TableProblem, read_table
 from catalogs.stars import BUILT_IN_NAMES, StarIndex, added_index, build_index, built_in_index, cache_folder, open_index
 from pipeline.curate import Json
@@ -32,6 +35,7 @@ from workflows.config import Configuration
 from workflows.store import RunFolder, read_json
 
 PER_IMAGE = "per-image"
+_LOG = logging.getLogger("pilotage")
 
 
 @dataclass(frozen=True)
@@ -54,6 +58,8 @@ class Setup:
         Output.
     software
         Version and digest of the code.
+    kernels
+        SPICE kernels in the order of loading.
     """
 
     archive: Archive
@@ -63,11 +69,12 @@ class Setup:
     per_image_stars: bool
     run_folder: RunFolder
     software: str
+    kernels: tuple[Kernel, ...] = ()
 
     def inputs_of(self, ref: ImageRef) -> tuple[str, ...]:
         """Paths, relative to the archive, whose bytes decide an image's answer."""
         paths = [ref.path, *ref.companions]
-        if self.archive.description.geometry != "header":
+        if self.archive.description.geometry in ("auto", "sidecar"):
             paths.append(stem(ref.path) + SIDECAR_SUFFIX)
         if self.per_image_stars:
             paths.append(stem(ref.path) + STARS_SUFFIX)
@@ -89,7 +96,10 @@ class Setup:
         description = self.archive.description.model_dump(mode="json", exclude={"name", "images", "select"})
         # Which keys of a body's block are said decides what they hide, which their values alone do not tell.
         bodies = {name: block.model_dump(mode="json") for name, block in self.bodies.items()}
-        parts: list[object] = [self.configuration.digest(), self.software, description, bodies, list(self.star_digests)]
+        kernels = [(kernel.name, kernel.sha256) for kernel in self.kernels]
+        parts: list[object] = [
+            self.configuration.digest(), self.software, description, bodies, list(self.star_digests), kernels
+        ]  # fmt: skip
         return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
 
 
@@ -134,7 +144,7 @@ def make_plan(archive: Archive, configuration: Configuration, run_folder: RunFol
     Raises
     ------
     ConfigurationError
-        If the archive or one of its star tables cannot be used.
+        If the archive, one of its star tables or of its kernels cannot be used.
     """
     name = archive.description.instrument
     if name is not None and name not in configuration.instruments:
@@ -145,6 +155,7 @@ def make_plan(archive: Archive, configuration: Configuration, run_folder: RunFol
     setup = Setup(
         archive, configuration, tuple(index.path for index in indexes),
         tuple((index.name, index.sha256) for index in indexes), per_image, run_folder, software_id(),
+        open_kernels(archive, configuration, verify),
     )  # fmt: skip
     every = list_images(archive, configuration.instruments)
     todo = [ref for ref in every if not _is_done(ref, setup, verify)]
@@ -157,6 +168,39 @@ def _check_settings(archive: Archive) -> None:
     except ValidationError as error:
         allowed = ", ".join(InstrumentSettings.model_fields)
         raise ConfigurationError(f"{archive.url}: settings.{first_problem(error)} (keys: {allowed})") from error
+
+
+def open_kernels(archive: Archive, configuration: Configuration, verify: bool = False) -> tuple[Kernel, ...]:
+    """Check an archive's SPICE kernels, and say where an instrument kernel contradicts a camera's block.
+
+    Parameters
+    ----------
+    archive
+        The archive.
+    configuration
+        With the camera blocks, which win.
+    verify
+        Read every kernel again instead of trusting size and modification time.
+
+    Returns
+    -------
+    tuple of Kernel
+        In the order of loading; none where the geometry comes from elsewhere.
+
+    Raises
+    ------
+    ConfigurationError
+        If kernels are wanted and not named, or one of them cannot be used.
+    """
+    description = archive.description
+    if description.geometry == "spice" and not description.kernels:
+        raise ConfigurationError(f"{archive.url}: geometry: spice needs kernels: say which meta-kernel to load")
+    if not description.kernels or description.geometry not in ("auto", "spice"):
+        return ()
+    kernels = check_kernels(archive.url, description.kernels, cache_folder(), verify)
+    for note in focal_length_notes(configuration.instruments):
+        _LOG.warning(note)
+    return kernels
 
 
 def open_star_tables(archive: Archive) -> tuple[list[StarIndex], bool]:

@@ -22,6 +22,7 @@ from catalogs.instruments import InstrumentBlock
 from catalogs.labels import Label, read_label
 from catalogs.shapes import read_shape
 from catalogs.sidecar import state_from_sidecar
+from catalogs.spice import load_bodies, state_from_spice
 from catalogs.star_sources import TableProblem, read_table
 from catalogs.stars import open_index, seen_from
 from pipeline.camera import field_of_view
@@ -190,6 +191,7 @@ class ImageRunner:
         self._options = setup.configuration.navigation()
         self._config_digest = setup.configuration.digest()
         self._meshes = Meshes(setup.archive)
+        self._known_bodies = load_bodies(setup.kernels) if setup.kernels else ()
 
     def run(self, ref: ImageRef) -> Outcome:
         """Navigate one image and write its document, then its mark.
@@ -256,13 +258,13 @@ class ImageRunner:
     def _state(
         self, ref: ImageRef, raw: RawImage, label: Label, inputs: Inputs
     ) -> tuple[State, InstrumentBlock | None, str]:
-        """Geometry from the sidecar where there is one (and it is allowed), else from the header."""
+        """Geometry from the sidecar where there is one, else from kernels, else from the header, as far as allowed."""
         description = self._setup.archive.description
         block = self._setup.configuration.instruments[label.block] if label.block is not None else None
         path = stem(ref.path) + SIDECAR_SUFFIX
         sidecar = inputs.data.get(path)
+        models = BodyModels(self._setup.bodies, lambda shape: self._meshes.read(shape, inputs), dirname(path))
         if sidecar is not None:
-            models = BodyModels(self._setup.bodies, lambda shape: self._meshes.read(shape, inputs), dirname(path))
             state = state_from_sidecar(
                 sidecar, ref.image_id, block, description.settings, raw.pixels.shape, models
             )  # fmt: skip
@@ -273,6 +275,11 @@ class ImageRunner:
             raise GeometryError(
                 StatusReason.CAMERA_UNKNOWN, "there is no sidecar, and no camera block claims the header"
             )
+        if description.geometry == "spice" or (self._setup.kernels and block.spice is not None):
+            camera = (block, label.mode)
+            known = self._known_bodies
+            state = state_from_spice(label, ref.image_id, camera, description.settings, known, models)
+            return state, block, "spice"
         return state_from_header(raw, ref.image_id, block, description.settings), block, "header"
 
     def _stars(self, ref: ImageRef, state: State, inputs: Inputs) -> StarTable:
@@ -296,9 +303,11 @@ class ImageRunner:
         image = inputs.digests.get(ref.path)
         listed = set(self._setup.inputs_of(ref))
         shapes = ((name, sha256) for name, sha256 in sorted(inputs.digests.items()) if name not in listed and sha256)
+        kernels = () if source in ("sidecar", "header") else self._setup.kernels
         return Provenance(
             self._setup.software, self._config_digest, ref.path, image, source,
             {"sidecar": sidecar, "header": image}.get(source or ""), catalogs, tuple(shapes),
+            tuple((kernel.name, kernel.sha256) for kernel in kernels),
         )  # fmt: skip
 
     def _error(self, ref: ImageRef, inputs: Inputs, reason: StatusReason, detail: str) -> dict[str, Json]:
