@@ -262,7 +262,8 @@ def instrument_attitude(names: SpiceNames, et: float) -> FloatArray:
         if names.ck_tolerance_s == 0.0:
             raise
     structure, instrument_from_structure = structure_of(names.frame, et)
-    ticks = [float(spiceypy.sce2c(names.spacecraft_id, t)) for t in (et, et + names.ck_tolerance_s)]
+    clock = int(spiceypy.ckmeta(structure, "SCLK"))
+    ticks = [float(spiceypy.sce2c(clock, t)) for t in (et, et + names.ck_tolerance_s)]
     pointing, _ = spiceypy.ckgp(structure, ticks[0], ticks[1] - ticks[0], _J2000)
     return np.asarray(instrument_from_structure @ np.array(pointing))
 

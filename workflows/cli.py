@@ -20,6 +20,7 @@ from catalogs.images import read_image
 from pipeline.curate import Json
 from pipeline.errors import ConfigurationError, PilotageError
 from workflows import catalog_cli, sample_cli
+from workflows.ck import FOLDER, write_c_kernels
 from workflows.config import Configuration, load_configuration, parse_setting
 from workflows.execute import ClusterOptions
 from workflows.plan import Plan, make_plan
@@ -249,6 +250,20 @@ def picture(
     raw = read_image(open_archive(archive, {}).read(path), path)
     write_atomically(output, draw_image(raw.pixels, document))
     typer.echo(f"{output}")
+
+
+@app.command()
+def ck(
+    run_folder: RunArg,
+    archive: ArchiveArg,
+    output: Annotated[Path | None, typer.Option("--output", "-o", help="Folder to write; RUN/ck by default.")] = None,
+    config: ConfigOption = [],  # noqa: B006
+    settings: SetOption = [],  # noqa: B006
+) -> None:
+    """Write corrected pointing as SPICE C-kernels, and a meta-kernel that loads them after the archive's own."""
+    folder = RunFolder(run_folder)
+    for path in write_c_kernels(folder, *_open(archive, config, settings), output or run_folder / FOLDER):
+        typer.echo(f"{path}")
 
 
 @app.command("config")
