@@ -2,6 +2,8 @@
 
 import json
 import shutil
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -9,8 +11,9 @@ import pytest
 import spiceypy
 
 from catalogs.kernels import check_kernels
-from pipeline.geometry.rotations import matrix_from_quaternion
+from pipeline.geometry.rotations import matrix_from_quaternion, quaternion_from_matrix, rotation_about
 from pipeline.records import FloatArray
+from tests.scenes.kernels import START_ET, write_kernels
 from tests.support import describe, document, pilotage, run_serial
 from workflows.config import load_configuration
 from workflows.samples.flyby import make_flyby_sample
@@ -81,28 +84,96 @@ def test_attitudes_come_back(archive: Path, run: Path, corrected: Path) -> None:
     spiceypy.kclear()
 
 
-def test_the_motion_within_an_exposure_is_the_original_one(archive: Path, run: Path, corrected: Path) -> None:
+def test_outside_of_exposures_the_original_pointing_holds(archive: Path, run: Path, corrected: Path) -> None:
     content = navigated(run)[0]
-    et, exposure = float(str(content["et"])), float(str(content["exposure_s"]))
-    ends = (et - exposure / 2, et + exposure / 2)
+    after = float(str(content["et"])) + float(str(content["exposure_s"])) / 2 + 0.3
     check_kernels(str(archive), "kernels/meta.tm", run)
-    before = [attitude(content, t) for t in (et, *ends)]
-    names = BLOCKS[str(content["label"]["block"])].spice  # type: ignore[index]
-    assert names is not None
-    _, rate = spiceypy.xf2rav(spiceypy.sxform("J2000", names.frame, et))
+    original = attitude(content, after)
     check_kernels(str(archive), str(corrected), run)
-    after = [attitude(content, t) for t in (et, *ends)]
-    for old, new in zip(before[1:], after[1:], strict=True):
-        assert angle(new, after[0] @ before[0].T @ old) < PROMISE_RAD
-    _, now = spiceypy.xf2rav(spiceypy.sxform("J2000", names.frame, et))
-    # The rate is that between the ends: its rounding is a nanoradian over the exposure.
-    assert np.array(now) == pytest.approx(np.array(rate), abs=PROMISE_RAD / exposure)
-    # Out of the exposures the original pointing holds.
-    check_kernels(str(archive), "kernels/meta.tm", run)
-    original = attitude(content, et + exposure / 2 + 0.3)
-    check_kernels(str(archive), str(corrected), run)
-    assert angle(attitude(content, et + exposure / 2 + 0.3), original) == 0.0
+    assert angle(attitude(content, after), original) == 0.0
     spiceypy.kclear()
+
+
+def answered(image_id: str, et: float, turn: FloatArray, sigma: float, exposure: float = 1.0) -> dict[str, object]:
+    """Document of an image of the loaded scene, its attitude corrected by a turn in the camera's frame."""
+    names = BLOCKS["coiss_nac"].spice
+    assert names is not None
+    before = names.rotation() @ np.array(spiceypy.pxform("J2000", names.frame, et))
+    return {
+        "image_id": image_id, "status": "success", "time_utc": "2009-07-04", "et": et, "exposure_s": exposure,
+        "label": {"block": "coiss_nac"}, "offset_px": [1.0, 2.0], "sigma_px": [sigma, sigma],
+        "pointing": {"camera_from_j2000_wxyz": quaternion_from_matrix(turn @ before).tolist()},
+    }  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Turning:
+    """A made-up run of a camera that turns: its archive, its documents, and what was planted."""
+
+    archive: Path
+    documents: dict[str, dict[str, object]]
+    turn: FloatArray
+    rate: FloatArray
+
+    def write(self) -> None:
+        """The run's files, and the C-kernels of it, which stay loaded."""
+        run = self.archive.parent / "run"
+        (run / "images").mkdir(parents=True)
+        (run / "plan.json").write_text(json.dumps({"images": sorted(self.documents)}))
+        for name, content in self.documents.items():
+            (run / "images" / f"{name}.json").write_text(json.dumps(content))
+        assert pilotage("ck", run, self.archive).code == 0
+        check_kernels(str(self.archive), str(run / "ck" / "corrected.tm"), run)
+
+
+@pytest.fixture
+def turning(tmp_path: Path) -> Iterator[Turning]:
+    write_kernels(tmp_path / "archive" / "kernels")
+    describe(tmp_path / "archive", images="*.IMG", geometry="spice", kernels="kernels/meta.tm")
+    check_kernels(str(tmp_path / "archive"), "kernels/meta.tm", tmp_path)
+    turn = rotation_about(np.array([0.3, -0.5, 0.8]), 1e-3)
+    et = START_ET + 1000.0
+    shots = [
+        ("a", et, 0.1, 1.0), ("b", et + 30.0, 0.2, 4.0), ("c", et + 31.0, 0.2, 4.0), ("d", et + 60.0, 0.3, 1.0),
+        ("e", et + 60.0, 0.1, 1.0),
+    ]  # fmt: skip
+    documents = {name: answered(name, at, turn, sigma, exposure) for name, at, sigma, exposure in shots}
+    # The other product of d's exposure was answered otherwise, and is the worse one.
+    documents["d"] = answered("d", et + 60.0, np.eye(3), 0.3)
+    _, rate = spiceypy.xf2rav(spiceypy.sxform("J2000", "CASSINI_ISS_NAC", et))
+    yield Turning(tmp_path / "archive", documents, turn, np.array(rate))
+    spiceypy.kclear()
+
+
+def test_the_motion_within_an_exposure_is_the_original_one(turning: Turning) -> None:
+    a = turning.documents["a"]
+    times = [float(str(a["et"])) + dt for dt in (-0.5, -0.2, 0.0, 0.3, 0.5)]
+    wanted = [turning.turn @ attitude(a, t) for t in times]
+    turning.write()
+    for t, attitude_then in zip(times, wanted, strict=True):
+        assert angle(attitude(a, t), attitude_then) < PROMISE_RAD
+    assert np.linalg.norm(turning.rate) == pytest.approx(2e-5, rel=1e-9)
+    names = BLOCKS["coiss_nac"].spice
+    assert names is not None
+    _, rate = spiceypy.xf2rav(spiceypy.sxform("J2000", names.frame, times[2]))
+    # In J2000 axes a correction in the camera's frame leaves the rate as it was.
+    assert np.array(rate) == pytest.approx(turning.rate, abs=PROMISE_RAD)
+
+
+def test_neighbours_share_the_time_between_them(turning: Turning) -> None:
+    b, c = turning.documents["b"], turning.documents["c"]
+    start, between = float(str(b["et"])), float(str(b["et"])) + 0.5
+    wanted = {t: turning.turn @ attitude(b, t) for t in (start - 1.9, start, between - 0.05, between + 0.05)}
+    wanted[start + 1.0] = turning.turn @ attitude(c)
+    turning.write()
+    for t, attitude_then in wanted.items():
+        assert angle(attitude(b, t), attitude_then) < PROMISE_RAD
+
+
+def test_of_two_products_of_an_exposure_the_surer_counts(turning: Turning) -> None:
+    wanted = turning.turn @ attitude(turning.documents["e"])
+    turning.write()
+    assert angle(attitude(turning.documents["d"]), wanted) < PROMISE_RAD
 
 
 def test_images_navigated_again_find_nothing(archive: Path, run: Path, corrected: Path) -> None:
