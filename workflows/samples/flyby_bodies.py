@@ -51,6 +51,17 @@ def _shade(sighting: Sighting, other: Sighting) -> tuple[FloatArray, FloatArray]
     return matrix, _scaled_from_j2000(other) @ (other.place_km - sighting.place_km)
 
 
+def _all_shades(sightings: list[Sighting], all_bodies: list[Sighting]) -> tuple[FloatArray, FloatArray]:
+    """Return the matrices (n, m, 3, 3) and centres (n, m, 3) of the bodies that may shade each of n bodies."""
+    shades = [[_shade(sighting, other) for other in shades_of(sighting, all_bodies)] for sighting in sightings]
+    most = max(len(found) for found in shades)
+    matrices, centres = np.zeros((len(shades), most, 3, 3)), np.zeros((len(shades), most, 3))
+    for k, found in enumerate(shades):
+        for j, (matrix, centre) in enumerate(found):
+            matrices[k, j], centres[k, j] = matrix, centre
+    return matrices, centres
+
+
 def centre_and_radius(
     camera: SampleCamera, camera_from_j2000: FloatArray, sighting: Sighting
 ) -> tuple[FloatArray, float]:
@@ -93,13 +104,7 @@ def prepare(
     radius_px = np.array([radius for _, radius in discs])
     widest = np.array([max(s.body.radii_km) / s.body.mean_radius_km for s in sightings])
     highest = np.array([item.terrain.highest for item in scenery])
-    shades = [[_shade(sighting, other) for other in shades_of(sighting, all_bodies)] for sighting in sightings]
-    most = max(len(found) for found in shades)
-    matrices_of_shades = np.zeros((len(scenery), most, 3, 3))
-    centres_of_shades = np.zeros((len(scenery), most, 3))
-    for k, found in enumerate(shades):
-        for j, (matrix, centre) in enumerate(found):
-            matrices_of_shades[k, j], centres_of_shades[k, j] = matrix, centre
+    shades, shade_centres = _all_shades(sightings, all_bodies)
     return Spheres(
         eye=np.array(eyes),
         from_camera=np.array([matrix @ camera_from_j2000.T for matrix in matrices]),
@@ -116,8 +121,8 @@ def prepare(
         parameter=np.array([s.body.surface.parameter for s in sightings]),
         brightness=np.array([item.brightness for item in scenery]),
         haze=np.array([(haze, LIMB_DEPTH if haze else 0.0, HAZE_BRIGHTNESS) for haze in hazes]),
-        shades=matrices_of_shades,
-        shade_centres=centres_of_shades,
+        shades=shades,
+        shade_centres=shade_centres,
         heights=np.stack([item.terrain.heights for item in scenery]),
         albedo=np.stack([item.terrain.albedo for item in scenery]),
         target=next(k for k, s in enumerate(sightings) if s.body.name == target),
