@@ -165,7 +165,10 @@ def _body_pass(
     """Techniques on planets and moons; through the point spread that the disc shows, where it was found."""
     outcomes: list[_Outcome] = []
     found = fix if isinstance(fix, DiscFix) else None
-    scene = found.scene if found else scene
+    if found:
+        scene = found.scene
+    elif context.fit_camera_rotation:
+        scene = scene.major()
     if techniques.BodyDiscCorrelateNav.enabled:
         outcomes.append(body_disc_nav(fix, context, techniques.BodyDiscCorrelateNav))
     if techniques.BodyLimbNav.enabled:

@@ -159,6 +159,23 @@ def _in_shadow(px, py, pz, sun, occluders):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
+def _covered_share(value, along_v, along_u):  # type: ignore[no-untyped-def]
+    """Share of a cell in which a plane is positive: its value in the middle, and its rise across the cell."""
+    a, b = abs(along_v), abs(along_u)
+    low, high = min(a, b), max(a, b)
+    q = value + (a + b) / 2.0
+    if q <= 0.0 or high == 0.0:
+        return 0.0
+    if q >= a + b:
+        return 1.0
+    if q < low:
+        return q * q / (2.0 * a * b)
+    if q <= high:
+        return (q - low / 2.0) / high
+    return 1.0 - (a + b - q) ** 2 / (2.0 * a * b)
+
+
+@numba.njit(cache=True, nogil=True)
 def _shade(ex, ey, disc, cx, cy, cz, bc, cbc, form, sun, law, parameter, occluders):  # type: ignore[no-untyped-def]
     """Radiance where a ray d = centre/z + e meets the body."""
     bex = form[0, 0] * ex + form[0, 1] * ey
@@ -218,7 +235,8 @@ def _draw(cells, cover, slopes, over, inner, centre, form, sun, law, parameter, 
             disc = k0 + x * (kx + mxx * x + 2.0 * mxy * y) + y * (ky + myy * y)
             dx, dy = kx + 2.0 * (mxx * x + mxy * y), ky + 2.0 * (mxy * x + myy * y)
             # The cell's corner is half a cell from its centre along each axis; curvature is granted as much again.
-            reach = 1.1 * step * (abs(dx * xv + dy * yv) + abs(dx * xu + dy * yu))
+            rise_v, rise_u = step * (dx * xv + dy * yv), step * (dx * xu + dy * yu)
+            reach = 1.1 * (abs(rise_v) + abs(rise_u))
             if not disc >= -reach:
                 continue
             if disc > reach and inner == 1:
@@ -239,9 +257,10 @@ def _draw(cells, cover, slopes, over, inner, centre, form, sun, law, parameter, 
                     covered += 1
                     light += _shade(ex, ey, disc_here, cx, cy, cz, bc, cbc, form, sun, law, parameter, occluders)
             if covered:
-                total = samples * samples
-                cells[i, j] = brightness * light / total + (1.0 - covered / total) * cells[i, j]
-                cover[i, j] += (1.0 - cover[i, j]) * covered / total
+                # Counting samples would make a limb ragged, and a ragged limb seems to show a rotation.
+                share = _covered_share(disc, rise_v, rise_u) if disc <= reach else 1.0
+                cells[i, j] = brightness * light / covered * share + (1.0 - share) * cells[i, j]
+                cover[i, j] += (1.0 - cover[i, j]) * share
 
 
 def cells_per_pixel(sigma_px: float, diameter_px: float) -> int:
@@ -349,6 +368,9 @@ class Template:
         Share of a pixel that unlit surface covers: its light (planetshine) is no part of ``image``.
     widening
         Derivative of ``image`` with respect to the variance of the point spread, per px^2.
+    spin
+        Derivative of ``image`` with respect to a rotation of each body about its own centre, per radian; None where
+        no rotation is asked for.
     """
 
     window: Window
@@ -357,6 +379,7 @@ class Template:
     along_u: Image
     night: Image
     widening: Image
+    spin: Image | None = None
 
 
 def gaussian_kernels(sigma: float) -> tuple[FloatArray, FloatArray]:

@@ -12,6 +12,7 @@ from pydantic import Field
 from pipeline.camera import project
 from pipeline.geometry.ellipsoid import limb_points
 from pipeline.geometry.pointing import corrected_attitude
+from pipeline.geometry.rotations import rotation_about
 from pipeline.imaging.illumination import law_of
 from pipeline.imaging.mesh import MeshSolid, render_meshes
 from pipeline.imaging.render import (
@@ -37,6 +38,10 @@ _CANVAS_SKY_PX = 24
 # Templates are drawn at offsets on this grid (pixels, and pixels at half the array's diagonal for a rotation), so that
 # techniques that agree share one; what is left is small enough for a linear model.
 QUANTUM_PX = 0.125
+# Half the rotation between two renderings of which the difference is the derivative.
+SPIN_STEP_RAD = 0.01
+# A body smaller than this share of the largest does not help to find it.
+MINOR_SHARE = 0.35
 
 
 class BodyPredictionOptions(Options):
@@ -272,7 +277,21 @@ class BodyScene:
         over = cells_per_pixel(self.sigma_px, largest)
         if any(view.body.mesh is not None for view in views):
             over = max(over, 2)
-        return blur(self._cells(views, window, over, 1 if largest > 60.0 else 2), window, self.sigma_px)
+        inner = 1 if largest > 60.0 else 2
+        template = blur(self._cells(views, window, over, inner), window, self.sigma_px)
+        if not self.state.settings.fit_camera_rotation:
+            return template
+        # A difference of renderings: along a limb the gradient times a long lever would be all rounding.
+        turned = [
+            blur_image(self._cells(self._spun(views, sign * SPIN_STEP_RAD), window, over, inner), window, self.sigma_px)
+            for sign in (1.0, -1.0)
+        ]
+        return replace(template, spin=(turned[0] - turned[1]) / np.float32(2.0 * SPIN_STEP_RAD))
+
+    def _spun(self, views: tuple[BodyView, ...], theta: float) -> tuple[BodyView, ...]:
+        """Bodies turned in the image, each about its own centre; +u goes toward +v."""
+        angle = self.state.camera_model.handedness * theta
+        return tuple(_turned(view, angle) for view in views)
 
     def render_coarse(self, window: Window) -> Image:
         """A-priori bodies in a window, one cell a pixel: good enough to find them by."""
@@ -292,9 +311,24 @@ class BodyScene:
                 render_cells(cells, solids, self.rays, window, [view.box for view in run], inner)
         return cells
 
+    def major(self) -> "BodyScene":
+        """The scene without bodies much smaller than its largest one."""
+        least = MINOR_SHARE * max((view.diameter_px for view in self.views), default=0.0)
+        return replace(self, views=tuple(v for v in self.views if v.diameter_px >= least), _templates={})
+
+    def minor(self) -> tuple[BodyView, ...]:
+        """What :meth:`major` leaves out."""
+        kept = set(self.major().names)
+        return tuple(view for view in self.views if view.body.name not in kept)
+
     def with_sigma(self, sigma_px: float) -> "BodyScene":
         """The same scene through another point spread."""
         return replace(self, sigma_px=sigma_px, _templates={})
+
+
+def _turned(view: BodyView, angle_rad: float) -> BodyView:
+    turn = rotation_about(view.centre_km / np.linalg.norm(view.centre_km), angle_rad)
+    return replace(view, camera_from_body=turn @ view.camera_from_body, sun=turn @ view.sun)
 
 
 def _runs(views: tuple[BodyView, ...]) -> list[tuple[list[BodyView], bool]]:

@@ -96,13 +96,17 @@ def limb_outline(views: tuple[BodyView, ...], camera: CameraModel, template: Tem
     return Outline.joined([part for part in parts if len(part)])
 
 
-def terminator_outline(views: tuple[BodyView, ...], camera: CameraModel, template: Template | None = None) -> Outline:
+def terminator_outline(
+    views: tuple[BodyView, ...], camera: CameraModel, template: Template | None = None, clear_px: float = 0.0
+) -> Outline:
     """Terminators of bodies, where the camera sees them.
 
     Parameters
     ----------
     views, camera, template
         As for :func:`limb_outline`.
+    clear_px
+        Distance from the limb, in the image, within which a terminator is left out.
 
     Returns
     -------
@@ -116,6 +120,11 @@ def terminator_outline(views: tuple[BodyView, ...], camera: CameraModel, templat
             continue
         points = terminator_points(view.body.radii_km, view.sun_from_body, _angles(view))
         seen = is_visible(view.body.radii_km, view.observer_km, points)
+        # Near the limb the line is foreshortened into it, and a band around it would measure the limb.
+        toward = view.observer_km - points
+        cosine = (surface_normal(view.body.radii_km, points) * toward).sum(axis=1) / np.linalg.norm(toward, axis=1)
+        clear = np.sqrt(1.0 - np.clip(cosine, 0.0, 1.0) ** 2) < 1.0 - clear_px / max(view.diameter_px / 2, 1e-9)
+        seen &= clear & (cosine > 0)
         sunward = project(camera, (view.centre_km + view.body.radii_km.min() * 1e-3 * view.sun)[None])[0][0]
         part = _outline(view, index, points[seen], np.ones(int(seen.sum()), bool), views, camera, sunward)
         parts.append(part)

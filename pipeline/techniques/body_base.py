@@ -155,32 +155,74 @@ def turn_lever(places_vu: FloatArray, pivot_vu: FloatArray) -> FloatArray:
     return np.asarray((places_vu - pivot_vu) @ plane_rotation_derivative(0.0).T)
 
 
-def settled_information(information: FloatArray, context: NavContext) -> tuple[FloatArray, bool]:
-    """Information with a rotation that the image does not show taken out of it, exactly.
+@dataclass(frozen=True, eq=False)
+class Settled:
+    """Information about a pivot, with a rotation that the image does not show taken out of it.
 
-    A circle's limb binds rotation and translation together (it sees neither apart from the other): what is left is the
-    information on their combinations, whose Schur complement in theta is zero.
+    Attributes
+    ----------
+    information
+        (2, 2) or (3, 3); row and column of theta are exact zeros where it is not observed.
+    pivot_vu
+        (2,) the given pivot, or where theta is not observed the point about which a rotation changes nothing: the
+        centre of a round disc, say, whose limb binds rotation and translation together about any other.
+    observed
+        Whether theta is.
+    """
+
+    information: FloatArray
+    pivot_vu: FloatArray
+    observed: bool
+
+
+def rotation_shows(information: FloatArray, context: NavContext) -> bool:
+    """Whether an image tells a rotation far better than its bound does, the translation being free.
 
     Parameters
     ----------
     information
         (2, 2) or (3, 3).
     context
+        Bound.
+
+    Returns
+    -------
+    bool
+        Never for two parameters.
+    """
+    if len(information) == 2:
+        return False
+    own = float(information[2, 2] - information[:2, 2] @ rotation_lever(information))
+    bound = context.max_rotation_rad / np.sqrt(3.0)
+    return own > 0 and 1.0 / np.sqrt(own) < _ROTATION_SEEN * bound
+
+
+def rotation_lever(information: FloatArray) -> FloatArray:
+    """(2,) offset that goes with a rotation of -1 and leaves the image as like as it can be."""
+    return np.asarray(np.linalg.pinv(information[:2, :2], rcond=1e-12, hermitian=True) @ information[:2, 2])
+
+
+def settle(information: FloatArray, pivot_vu: FloatArray, context: NavContext) -> Settled:
+    """Keep a rotation that is observed; else move the pivot to where the rotation does not matter.
+
+    Parameters
+    ----------
+    information
+        (2, 2) or (3, 3) about the pivot.
+    pivot_vu
+        (2,).
+    context
         Bound of the rotation.
 
     Returns
     -------
-    tuple
-        Information; whether theta is observed.
+    Settled
+        Ready for a result.
     """
-    if len(information) == 2:
-        return information, False
-    block, cross = information[:2, :2], information[:2, 2]
-    lever = np.linalg.pinv(block, rcond=1e-12) @ cross
-    own = float(information[2, 2] - cross @ lever)
-    bound = context.max_rotation_rad / np.sqrt(3.0)
-    if own > 0 and 1.0 / np.sqrt(own) < _ROTATION_SEEN * bound:
-        return information, True
-    settled = information.copy()
-    settled[2, 2] = float(lever @ block @ lever)
-    return settled, False
+    if len(information) == 2 or rotation_shows(information, context):
+        return Settled(information, pivot_vu, len(information) == 3)
+    # d + lever * theta is what is known; about p + R'^-1 lever it is the offset alone.
+    moved = pivot_vu + np.linalg.inv(plane_rotation_derivative(0.0)) @ rotation_lever(information)
+    known = np.zeros((3, 3))
+    known[:2, :2] = information[:2, :2]
+    return Settled(known, moved, False)

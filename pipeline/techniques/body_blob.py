@@ -89,7 +89,8 @@ def body_blob_nav(
         if float(np.hypot(*(offset - before))) < _SETTLED_PX:
             break
     covariance = _covariance(cutout, frame, moment, options)
-    return _result(offset, covariance, cutout, scene, context, confidence, options)
+    place = moment.middle + moment.shift
+    return _result(offset, covariance, place, scene, context, confidence, options)
 
 
 def _brightest(
@@ -156,6 +157,8 @@ class _Moment:
     ----------
     shift
         (2,) that moves the template's moment onto the image's.
+    middle
+        (2,) pixel of the template's moment.
     lever
         (n, 2) weight of each pixel's light in ``shift``, pixels per DN.
     support
@@ -165,6 +168,7 @@ class _Moment:
     """
 
     shift: FloatArray
+    middle: FloatArray
     lever: FloatArray
     support: BoolArray
     scale: float
@@ -195,7 +199,8 @@ def _moment(cutout: Cutout) -> _Moment | None:
     slopes = np.stack([cutout.template.along_v[support], cutout.template.along_u[support]], axis=1).astype(float)
     answer = -(arm.T @ slopes)
     lever = arm @ np.linalg.inv(answer).T / scale
-    return _Moment(lever.T @ data, lever, support, scale, sky)
+    place = middle + [cutout.window.v0, cutout.window.u0]
+    return _Moment(lever.T @ data, place, lever, support, scale, sky)
 
 
 def _border(good: BoolArray) -> BoolArray:
@@ -226,15 +231,15 @@ def _covariance(cutout: Cutout, frame: Frame, moment: _Moment, options: BodyBlob
 def _result(
     offset: FloatArray,
     covariance: FloatArray,
-    cutout: Cutout,
+    place_vu: FloatArray,
     scene: BodyScene,
     context: NavContext,
     confidence: float,
     options: BodyBlobOptions,
 ) -> TechniqueResult:
-    view = cutout.views[0]
     full = embed_rotation_unobservable(covariance) if context.fit_camera_rotation else covariance
-    pivot = predicted_place(context, offset, 0.0, view.centre_vu)
+    # About its own moment a rotation does nothing to a moment.
+    pivot = predicted_place(context, offset, 0.0, place_vu)
     at_edge, turned = edge_flags(offset, 0.0, context, options)
     sigma = float(np.sqrt(np.trace(covariance) / 2.0))
     one = np.ones(1)
@@ -243,8 +248,8 @@ def _result(
         information=information_of(full), pivot_vu=pivot, confidence=confidence, at_edge=at_edge,
         at_edge_rotation=turned, error_sources=tuple(f"body:{name}" for name in scene.names),
         features=FeatureTable(
-            name=np.array([view.body.name]), kind=np.array(["blob"]), predicted_vu=pivot[None],
-            measured_vu=view.centre_vu[None], residual_vu=np.zeros((1, 2)), sigma_px=sigma * one,
+            name=np.array([scene.views[0].body.name]), kind=np.array(["blob"]), predicted_vu=pivot[None],
+            measured_vu=place_vu[None], residual_vu=np.zeros((1, 2)), sigma_px=sigma * one,
             mag=np.nan * one, snr=np.nan * one, used=np.ones(1, bool), reason=np.array([""]),
         ),
         diagnostics={"extra_sigma_px": sigma},

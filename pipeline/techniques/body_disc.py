@@ -18,6 +18,7 @@ from pipeline.techniques.base import (
     edge_flags,
 )
 from pipeline.techniques.body_base import about, predicted_place
+from pipeline.techniques.body_minor import find_rotation, start_with_rotation
 from pipeline.techniques.body_search import Acquisition, BodySearchOptions, find_bodies
 from pipeline.techniques.model_errors import ModelErrorOptions
 from pipeline.techniques.template_fit import TemplateFit, fit_template
@@ -76,10 +77,32 @@ def find_disc(scene: BodyScene, frame: Frame, context: NavContext, options: Body
     DiscFix or str
         Or why nothing was found.
     """
-    found = find_bodies(scene, frame, context, options.search)
+    # With a rotation to be found a small body far from a large one would be lost between two samples of it.
+    part = scene.major() if context.fit_camera_rotation else scene
+    found = find_bodies(part, frame, context, options.search)
     if isinstance(found, str):
         return found
-    fit = fit_template(scene, frame, found.offset_vu, found.rotation_rad, context, options.errors)
+    fitted = _sharpened(part, frame, found.offset_vu, found.rotation_rad, context, options)
+    if isinstance(fitted, str):
+        return fitted
+    part, fit = fitted
+    drift = float(np.hypot(*(fit.offset_vu - found.offset_vu)))
+    if drift > options.largest_drift_px + 0.1 * max(view.diameter_px for view in part.views):
+        return f"the fit ran {drift:.1f} px away from the correlation's peak"
+    if len(part) < len(scene) and context.fit_camera_rotation:
+        everything = scene.with_sigma(part.sigma_px)
+        whole = _with_minor_bodies(everything, fit, frame, context, options)
+        if whole is not None:
+            return DiscFix(found, whole, everything)
+    return DiscFix(found, fit, part)
+
+
+def _sharpened(
+    scene: BodyScene, frame: Frame, offset_vu: FloatArray, rotation_rad: float, context: NavContext,
+    options: BodyDiscOptions,
+) -> tuple[BodyScene, TemplateFit] | str:  # fmt: skip
+    """Fit, through the point spread that the image itself shows."""
+    fit = fit_template(scene, frame, offset_vu, rotation_rad, context, options.errors)
     for _ in range(_WIDTH_ROUNDS):
         if isinstance(fit, str) or abs(fit.variance_px2) < _WIDTH_SIGMAS * fit.variance_sigma_px2:
             break
@@ -88,12 +111,25 @@ def find_disc(scene: BodyScene, frame: Frame, context: NavContext, options: Body
             break
         scene = scene.with_sigma(sigma)
         fit = fit_template(scene, frame, fit.offset_vu, fit.rotation_rad, context, options.errors)
-    if isinstance(fit, str):
-        return fit
-    drift = float(np.hypot(*(fit.offset_vu - found.offset_vu)))
-    if drift > options.largest_drift_px + 0.1 * max(view.diameter_px for view in scene.views):
-        return f"the fit ran {drift:.1f} px away from the correlation's peak"
-    return DiscFix(found, fit, scene)
+    return fit if isinstance(fit, str) else (scene, fit)
+
+
+def _with_minor_bodies(
+    scene: BodyScene, fit: TemplateFit, frame: Frame, context: NavContext, options: BodyDiscOptions
+) -> TemplateFit | None:
+    """Fit of all bodies, where the small ones are found; their rotation goes about the large ones."""
+    if fit.information[2, 2] > 0:
+        theta: float | None = 0.0
+    else:
+        theta = find_rotation(scene, fit, frame, context)
+    if theta is None:
+        return None
+    offset, rotation = start_with_rotation(fit, theta, context)
+    whole = fit_template(scene, frame, offset, rotation, context, options.errors)
+    if isinstance(whole, str) or whole.correlation < 0.8 * fit.correlation:
+        return None
+    drift = float(np.hypot(*(whole.offset_vu - offset)))
+    return whole if drift < options.largest_drift_px else None
 
 
 def body_disc_nav(

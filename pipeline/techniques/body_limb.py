@@ -6,6 +6,7 @@ import numpy as np
 from pydantic import Field
 
 from pipeline.frame import Frame
+from pipeline.geometry.rotations import plane_rotation
 from pipeline.imaging.edges import distance_to_edges, edge_field
 from pipeline.predict.bodies import BodyScene, BodyView
 from pipeline.predict.outlines import limb_outline, terminator_outline
@@ -26,13 +27,15 @@ from pipeline.techniques.body_base import (
     compose,
     cut_out,
     predicted_place,
+    rotation_shows,
     rough_levels,
-    settled_information,
+    settle,
     turn_lever,
 )
 from pipeline.techniques.contour_fit import BandOptions, Segments, measure_segments
 from pipeline.techniques.line_search import LinePlace, search_line
 from pipeline.techniques.lm import lm_subpixel_refine
+from pipeline.techniques.model_errors import ModelErrorOptions, assumed_errors
 from pipeline.techniques.relief import Field_, ReliefFit, ReliefOptions, fit_relief
 from pipeline.techniques.template_fit import TemplateFit
 
@@ -42,6 +45,8 @@ _SETTLED_PX = 0.02
 # Spacing at which vertices tell something new about whether the line is there at all.
 _INDEPENDENT_PX = 4.0
 _RIVAL_PX = 6.0
+# A technique that does not search vouches for a place only so far.
+_FOLLOWER = 0.99
 _REACH_PX = 8.0
 
 
@@ -50,7 +55,9 @@ class BodyLimbOptions(TechniqueOptions):
 
     band: BandOptions = BandOptions()
     relief: ReliefOptions = ReliefOptions()
+    errors: ModelErrorOptions = ModelErrorOptions()
     relief_share: float = Field(2e-3, gt=0, le=0.2, description="relief over radius where no catalogue tells it")
+    band_share: float = Field(0.25, gt=0, le=1, description="half-width of the band over the radius of small bodies")
     edge_sigma: float = Field(5.0, ge=2, le=50, description="gradient over its noise that makes an edge")
     min_score: float = Field(0.25, gt=0, lt=1, description="agreement with edges below which there is no limb")
     min_diameter_px: float = Field(5.0, ge=3, le=100, description="bodies below this have no limb to measure")
@@ -62,6 +69,7 @@ class BodyTerminatorOptions(TechniqueOptions):
 
     band: BandOptions = BandOptions(brightness_share=0.5, sky_share=0.01, largest_shift_px=20.0)
     relief: ReliefOptions = ReliefOptions(unknown_width=2.0)
+    errors: ModelErrorOptions = ModelErrorOptions()
     band_share: float = Field(0.2, gt=0, le=1, description="half-width of the band over the radius")
     relief_share: float = Field(0.01, gt=0, le=0.5, description="expected wandering of the line over the radius")
     reach_deg: float = Field(4.0, gt=0, le=90, description="angle over which it wanders alike")
@@ -120,8 +128,13 @@ def body_limb_nav(
     start = _find_limb(scene, frame, context, options)
     if isinstance(start, str):
         return TechniqueFailure(LIMB, StatusReason.NO_FEATURES_DETECTED, start)
+    start = _same_basin(start, fix, scene, context)
     fields = {k: _limb_field(view, options.relief_share) for k, view in enumerate(scene.views)}
-    fit = _fit_line(scene, frame, fix, start, context, fields, options.band, options.relief, at_limb=True)
+    # Of a small body the band is to hold the limb, not all of it.
+    radius = max(view.diameter_px for view in large) / 2
+    width = float(np.clip(options.band_share * radius, 2.0, options.band.half_width_px))
+    band = options.band.model_copy(update={"half_width_px": width})
+    fit = _fit_line(scene, frame, fix, start, context, fields, band, options.relief, options.errors, at_limb=True)
     if isinstance(fit, str):
         return TechniqueFailure(LIMB, StatusReason.NO_FEATURES_DETECTED, fit)
     return _result(LIMB, "limb", fit, start, scene, context, options, options.min_shown_share)
@@ -156,12 +169,12 @@ def body_terminator_nav(
     radius = max(view.diameter_px for view in scene.views) / 2
     width = float(np.clip(options.band_share * radius, options.band.half_width_px, 60.0))
     band = options.band.model_copy(update={"half_width_px": width})
-    start = _Start(fix.offset_vu, fix.rotation_rad, confidence, fix.correlation)
+    start = _Start(fix.offset_vu, fix.rotation_rad, min(confidence, _FOLLOWER), fix.correlation)
     fields = {
         k: Field_(options.relief_share * view.diameter_px / 2, options.reach_deg, False, 0.0)
         for k, view in enumerate(scene.views)
     }
-    fit = _fit_line(scene, frame, fix, start, context, fields, band, options.relief, at_limb=False)
+    fit = _fit_line(scene, frame, fix, start, context, fields, band, options.relief, options.errors, at_limb=False)
     if isinstance(fit, str):
         return TechniqueFailure(TERMINATOR, StatusReason.NO_FEATURES_DETECTED, fit)
     return _result(TERMINATOR, "terminator", fit, start, scene, context, options, options.min_shown_share)
@@ -224,6 +237,23 @@ def _find_limb(scene: BodyScene, frame: Frame, context: NavContext, options: Bod
     return _Start(centre, theta, confidence, best.score)
 
 
+def _same_basin(start: _Start, fix: TemplateFit | None, scene: BodyScene, context: NavContext) -> _Start:
+    """Begin at the rendered fit where the limb was found about there: both settle in the same place, one sooner."""
+    if fix is None:
+        return start
+    places = np.array([view.centre_vu for view in scene.views])
+    gap = _moved(places, start.offset_vu, start.rotation_rad, context) - _moved(
+        places, fix.offset_vu, fix.rotation_rad, context
+    )
+    near = float(np.abs(gap).max()) < _RIVAL_PX
+    return _Start(fix.offset_vu, fix.rotation_rad, start.confidence, start.score) if near else start
+
+
+def _moved(places_vu: FloatArray, offset_vu: FloatArray, rotation_rad: float, context: NavContext) -> FloatArray:
+    centre = context.camera_model.centre_vu
+    return np.asarray(centre + offset_vu + (places_vu - centre) @ plane_rotation(rotation_rad).T)
+
+
 def _line_confidence(found: list[LinePlace], places: FloatArray, limits: tuple[float, float]) -> float:
     """Probability that the best place is neither an accident nor less likely than a rival."""
     best = found[0]
@@ -247,6 +277,7 @@ def _fit_line(
     fields: dict[int, Field_],
     band: BandOptions,
     relief_options: ReliefOptions,
+    error_options: ModelErrorOptions,
     at_limb: bool,
 ) -> _LineFit | str:
     """Measure, fit, predict again, until the template's own grid is reached."""
@@ -256,11 +287,17 @@ def _fit_line(
         cutout = cut_out(scene, frame, offset, rotation)
         if not cutout.views or not cutout.good.any():
             return "the body is outside the frame"
-        outline = (limb_outline if at_limb else terminator_outline)(cutout.views, context.camera_model, cutout.template)
+        camera = context.camera_model
+        if at_limb:
+            outline = limb_outline(cutout.views, camera, cutout.template)
+        else:
+            clear = band.half_width_px + 3.0 * cutout.sigma_px
+            outline = terminator_outline(cutout.views, camera, cutout.template, clear)
         levels = _levels(cutout, fix)
         if not levels.scale > 0:
             return "the image is not bright where the body is"
-        segments = measure_segments(cutout, outline, frame, levels, band)
+        errors = fix.errors if fix is not None else assumed_errors(cutout.views, error_options)
+        segments = measure_segments(cutout, outline, frame, levels, errors, band)
         if isinstance(segments, str):
             return segments
         good = segments.take(segments.ok)
@@ -268,7 +305,7 @@ def _fit_line(
         pivot = weight @ good.place_vu / weight.sum()
         lever = None if fixed_turn else turn_lever(good.place_vu, pivot)
         relief = fit_relief(good, lever, fields, relief_options)
-        if not fixed_turn and not settled_information(relief.information, context)[1]:
+        if not fixed_turn and not rotation_shows(relief.information, context):
             # The line does not show the rotation: what the others can tell is fitted without it.
             flat = fit_relief(good, None, fields, relief_options)
             step = np.append(flat.step, 0.0)
@@ -309,13 +346,15 @@ def _result(
     if share < min_shown_share:
         detail = f"{share:.0%} of the {kind} shows the expected edge"
         return TechniqueFailure(name, StatusReason.NO_FEATURES_DETECTED, detail)
-    information, _ = settled_information(fit.relief.information, context)
-    pivot = predicted_place(context, fit.offset_vu, fit.rotation_rad, fit.pivot_vu)
+    # Segments that scatter more than all that was granted to them are as much less certain (Birge 1932).
+    information = fit.relief.information / max(fit.relief.chi2_per_segment, 1.0)
+    settled = settle(information, fit.pivot_vu, context)
+    pivot = predicted_place(context, fit.offset_vu, fit.rotation_rad, settled.pivot_vu)
     at_edge, at_edge_rotation = edge_flags(fit.offset_vu, fit.rotation_rad, context, options)
     radius = max(view.diameter_px for view in fit.views) / 2
     return TechniqueResult(
         technique=name, offset_vu=about(context, fit.offset_vu, fit.rotation_rad, pivot),
-        rotation_rad=fit.rotation_rad, information=information, pivot_vu=pivot, confidence=start.confidence,
+        rotation_rad=fit.rotation_rad, information=settled.information, pivot_vu=pivot, confidence=start.confidence,
         at_edge=at_edge, at_edge_rotation=at_edge_rotation,
         spurious=fit.relief.rms_px + fit.relief.long_px > 0.3 * radius,
         error_sources=tuple(f"body:{name}" for name in scene.names),

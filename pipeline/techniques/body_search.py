@@ -31,16 +31,28 @@ class BodySearchOptions(Options):
 
     least_level_px: float = Field(5.0, ge=2, le=64, description="size of the largest body at the coarsest level")
     candidates: int = Field(5, ge=1, le=50, description="peaks followed from the coarsest level down")
-    min_correlation: float = Field(0.2, ge=0, lt=1, description="correlation below which nothing was found")
+    min_correlation: float = Field(0.05, ge=0, lt=1, description="correlation below which nothing was found")
+    most_rotations: int = Field(61, ge=11, le=1001, description="most rotations tried at the coarsest level")
 
 
 @dataclass(frozen=True)
 class Peak:
-    """A place where the predicted image fits: offset about the scene's pivot, rotation, correlation."""
+    """A place where the predicted image fits.
+
+    Attributes
+    ----------
+    offset_vu, rotation_rad
+        About the scene's pivot.
+    correlation
+        At the finest level to which it was followed.
+    compared
+        At the level down to which all candidates were followed.
+    """
 
     offset_vu: tuple[float, float]
     rotation_rad: float
     correlation: float
+    compared: float
 
 
 @dataclass(frozen=True)
@@ -77,6 +89,7 @@ class _Pyramid:
     template: Image
     pivot: FloatArray
     factors: tuple[int, ...]
+    rotations: int
 
     def level(self, factor: int) -> Level:
         return make_level(self.image, self.good, factor)
@@ -123,16 +136,13 @@ def find_bodies(
     if not peaks:
         return "the predicted image has no contrast"
     for depth, factor in enumerate(pyramid.factors[1:], start=1):
-        keep = options.candidates if factor >= 4 else (3 if factor == 2 else 1)
-        followed = sorted((_follow(peak, pyramid, factor, depth, context) for peak in peaks), key=_height)[-keep:]
-        if factor == 1:
-            # At full size only the winner is followed; rivals keep the correlation of the level above.
-            peaks = [_follow(peaks[0], pyramid, 1, depth, context), *peaks[1:]]
-        else:
-            peaks = followed[::-1]
-    best = peaks[0]
-    if best.correlation < options.min_correlation:
-        return f"best correlation {best.correlation:.2f}"
+        # At full size only the winner is followed; rivals are compared with it at the level above.
+        follow = peaks if factor > 1 else peaks[:1]
+        keep = options.candidates if factor >= 4 else 3
+        followed = [_follow(peak, pyramid, factor, depth, context) for peak in follow]
+        peaks = sorted(followed, key=_height, reverse=True)[:keep] if factor > 1 else [*followed, *peaks[1:]]
+    if peaks[0].correlation < options.min_correlation:
+        return f"best correlation {peaks[0].correlation:.2f}"
     return _judge(peaks, pyramid, scene, context)
 
 
@@ -160,8 +170,18 @@ def _prepare(scene: BodyScene, frame: Frame, context: NavContext, options: BodyS
     pivot = scene.pivot_vu - [window.v0, window.u0]
     return _Pyramid(
         region, (surplus[0], surplus[1]), frame.raw[rows_in, cols_in], ~frame.bad[rows_in, cols_in], template, pivot,
-        factors,
+        factors, _rotations(scene, context, largest, options),
     )  # fmt: skip
+
+
+def _rotations(scene: BodyScene, context: NavContext, size_px: float, options: BodySearchOptions) -> int:
+    """Rotations at the coarsest level: the seed's eleven, more where they would jump bodies by over half their size."""
+    bound = context.max_rotation_rad
+    if not bound:
+        return 1
+    arm = max(float(np.hypot(*(view.centre_vu - scene.pivot_vu))) for view in scene.views)
+    wanted = int(np.ceil(2.0 * bound * arm / max(0.5 * size_px, 2.0))) + 1
+    return int(np.clip(wanted, ROTATION_SAMPLES[0], options.most_rotations)) | 1
 
 
 def _reach(scene: BodyScene, context: NavContext) -> tuple[int, int]:
@@ -178,7 +198,7 @@ def _coarsest(pyramid: _Pyramid, context: NavContext, options: BodySearchOptions
     factor = pyramid.factors[0]
     level = pyramid.level(factor)
     bound = context.max_rotation_rad
-    thetas = np.linspace(-bound, bound, ROTATION_SAMPLES[0]) if bound else np.zeros(1)
+    thetas = np.linspace(-bound, bound, pyramid.rotations) if bound else np.zeros(1)
     maps = np.stack([ncc_map(level, pyramid.turned(factor, float(theta))) for theta in thetas])
     best, which = maps.max(axis=0), maps.argmax(axis=0)
     around = cv2.dilate(best, np.ones((3, 3)))
@@ -188,7 +208,7 @@ def _coarsest(pyramid: _Pyramid, context: NavContext, options: BodySearchOptions
     return [
         Peak(
             (float((rows[k] - middle_v) * factor), float((cols[k] - middle_u) * factor)),
-            float(thetas[which[rows[k], cols[k]]]), float(best[rows[k], cols[k]]),
+            float(thetas[which[rows[k], cols[k]]]), float(best[rows[k], cols[k]]), float(best[rows[k], cols[k]]),
         )
         for k in order
     ]  # fmt: skip
@@ -199,10 +219,10 @@ def _follow(peak: Peak, pyramid: _Pyramid, factor: int, depth: int, context: Nav
     level = pyramid.level(factor)
     bound = context.max_rotation_rad
     samples = ROTATION_SAMPLES[min(depth, len(ROTATION_SAMPLES) - 1)] if bound else 1
-    step = 2.0 * bound / (ROTATION_SAMPLES[0] - 1) / 2.0**depth
+    step = 2.0 * bound / max(pyramid.rotations - 1, 1) / 2.0**depth
     thetas = peak.rotation_rad + step * (np.arange(samples) - samples // 2)
     start = (round(peak.offset_vu[0] / factor), round(peak.offset_vu[1] / factor))
-    best = peak if factor == 1 else Peak(peak.offset_vu, peak.rotation_rad, -1.0)
+    best = peak
     found = -2.0
     for theta in np.clip(thetas, -bound, bound):
         template = pyramid.turned(factor, float(theta))
@@ -215,7 +235,8 @@ def _follow(peak: Peak, pyramid: _Pyramid, factor: int, depth: int, context: Nav
         if height > found:
             found = height
             offset = ((here[0] + place[0]) * factor, (here[1] + place[1]) * factor)
-            best = Peak((float(offset[0]), float(offset[1])), float(theta), height)
+            compared = peak.compared if factor == 1 else height
+            best = Peak((float(offset[0]), float(offset[1])), float(theta), height, compared)
     return best
 
 
@@ -227,14 +248,14 @@ def _judge(peaks: list[Peak], pyramid: _Pyramid, scene: BodyScene, context: NavC
     count = _independent(best, level, pyramid, factor)
     apart = _SAME_PEAK * max(view.diameter_px for view in scene.views)
     rivals = [p for p in peaks[1:] if np.hypot(*np.subtract(p.offset_vu, best.offset_vu)) > max(apart, 2.0 * factor)]
-    fit = _log_misfit(best.correlation)
+    fit = _log_misfit(best.compared)
     tries = float(np.prod([2 * n + 1 for n in pyramid.surplus])) / max(scene.views[-1].diameter_px, 1.0) ** 2
     # Three parameters were fitted; a place is as good as its likelihood over that of all others.
     doubt = max(tries, 1.0) * np.exp(np.clip(count / 2.0 * fit + 3.0, -700.0, 50.0))
-    doubt += sum(np.exp(np.clip(count / 2.0 * (fit - _log_misfit(p.correlation)), -700.0, 0.0)) for p in rivals)
+    doubt += sum(np.exp(np.clip(count / 2.0 * (fit - _log_misfit(p.compared)), -700.0, 0.0)) for p in rivals)
     centre = context.camera_model.centre_vu
     offset = move_pivot(np.array(best.offset_vu), best.rotation_rad, scene.pivot_vu, centre)[0]
-    rival = max((p.correlation for p in rivals), default=-1.0)
+    rival = max((p.compared for p in rivals), default=-1.0)
     return Acquisition(offset, best.rotation_rad, best.correlation, float(1.0 / (1.0 + doubt)), rival)
 
 

@@ -19,9 +19,12 @@ from pipeline.options import Options
 from pipeline.predict.outlines import Outline
 from pipeline.records import BoolArray, FloatArray, Record
 from pipeline.techniques.body_base import Cutout, Levels
+from pipeline.techniques.model_errors import ModelErrors
 
 _FEWEST_SEGMENTS = 4
 _FEWEST_PIXELS = 6
+# Variance of a place inside a pixel.
+_PIXEL_VARIANCE = 1.0 / 12.0
 
 
 class BandOptions(Options):
@@ -51,6 +54,10 @@ class Segments(Record):
         (m,) along the normal, and its 1 sigma from the pixels' noise.
     strength
         (m,) brightness relative to the template's, over its sigma.
+    texture_px
+        1 sigma of the shift that unknown albedo makes: a gradient of brightness across a blurred edge moves it.
+    texture_reach_px
+        Distance over which that is alike.
     ok
         (m,) False where nothing could be measured.
     """
@@ -63,6 +70,8 @@ class Segments(Record):
     sigma_px: FloatArray
     strength: FloatArray
     ok: BoolArray
+    texture_px: float
+    texture_reach_px: float
 
     def __post_init__(self) -> None:
         m = len(self.place_vu)
@@ -76,11 +85,12 @@ class Segments(Record):
 
     def take(self, index: NDArray[np.generic]) -> "Segments":
         """Rows of an index or mask."""
-        return Segments(*(getattr(self, name)[index] for name in Segments.__dataclass_fields__))
+        arrays = (getattr(self, name)[index] for name in list(Segments.__dataclass_fields__)[:-2])
+        return Segments(*arrays, self.texture_px, self.texture_reach_px)
 
 
 def measure_segments(
-    cutout: Cutout, outline: Outline, frame: Frame, levels: Levels, options: BandOptions
+    cutout: Cutout, outline: Outline, frame: Frame, levels: Levels, errors: ModelErrors, options: BandOptions
 ) -> Segments | str:
     """Measure how far the image's edge lies from the template's, piece by piece.
 
@@ -94,6 +104,8 @@ def measure_segments(
         Noise.
     levels
         Brightness of the template's unit, of the sky and of night sides.
+    errors
+        Of the rendering, for its unknown albedo.
     options
         Band.
 
@@ -132,7 +144,10 @@ def measure_segments(
     shift = values[:, 0]
     ok = dense & np.isfinite(shift) & np.isfinite(sigma) & (np.abs(shift) <= options.largest_shift_px)
     ok &= sigma <= options.largest_shift_px
-    segments = Segments(place, normal, direction, body, np.nan_to_num(shift), sigma, strength, ok)
+    blur2 = cutout.sigma_px**2 + _PIXEL_VARIANCE
+    reach = max(errors.texture_px, float(np.sqrt(blur2)))
+    texture = errors.texture * blur2 / reach
+    segments = Segments(place, normal, direction, body, np.nan_to_num(shift), sigma, strength, ok, texture, reach)
     return segments if np.count_nonzero(ok) >= _FEWEST_SEGMENTS else "too few pieces of the outline show an edge"
 
 

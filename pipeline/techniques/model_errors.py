@@ -29,6 +29,8 @@ class ModelErrorOptions(Options):
     texture: float = Field(0.07, gt=0, le=1, description="rms of unknown albedo, relative (icy moons: 0.03 to 0.15)")
     texture_dof: float = Field(20.0, ge=0, le=1e4, description="weight of that figure, in independent patches")
     texture_reach: float = Field(0.15, gt=0, le=2, description="reach of albedo where it cannot be told, radii")
+    wide_share: float = Field(0.7, ge=0, le=2, description="rms of albedo of wide reach, relative to all of it")
+    wide_reach: float = Field(0.6, gt=0, le=3, description="that reach, radii")
     relief_share: float = Field(2e-3, ge=0, le=0.2, description="relief over radius where no catalogue tells it")
 
 
@@ -40,12 +42,16 @@ class ModelErrors:
     ----------
     texture, texture_px
         Relative rms and reach.
+    wide_texture, wide_texture_px
+        The same of provinces as large as hemispheres, which no single image can tell from the body's shading.
     relief_px, relief_reach_px
         1 sigma along the gradient and reach along the surface.
     """
 
     texture: float
     texture_px: float
+    wide_texture: float
+    wide_texture_px: float
     relief_px: float
     relief_reach_px: float
 
@@ -70,7 +76,8 @@ def assumed_errors(views: tuple[BodyView, ...], options: ModelErrorOptions) -> M
     sigma_km = view.body.shape_sigma_km
     relief = options.relief_share * radius if sigma_km is None else sigma_km * view.px_per_km
     reach = float(np.radians(view.body.shape_correlation_deg)) * radius
-    return ModelErrors(options.texture, max(options.texture_reach * radius, 1.0), relief, max(reach, 1.0))
+    narrow, wide = (max(share * radius, 1.0) for share in (options.texture_reach, options.wide_reach))
+    return ModelErrors(options.texture, narrow, options.wide_share * options.texture, wide, relief, max(reach, 1.0))
 
 
 def measured_errors(
@@ -120,7 +127,8 @@ def measured_errors(
         left = excess[edge] - (texture * light[edge]) ** 2
         relief2 = float(np.median(left) / _MEDIAN_SQUARE / np.median(slope[edge] ** 2))
     relief = max(assumed.relief_px, float(np.sqrt(max(relief2, 0.0))))
-    return replace(assumed, texture=texture, texture_px=reach, relief_px=relief)
+    wide = options.wide_share * texture
+    return replace(assumed, texture=texture, texture_px=reach, wide_texture=wide, relief_px=relief)
 
 
 def _reach(ratio: FloatArray, inside: BoolArray, rms: float, default: float) -> float:

@@ -121,12 +121,13 @@ def fit_relief(
         design = np.column_stack([design, (segments.normal_vu * lever).sum(axis=1)])
     bodies = sorted(set(segments.body.tolist()))
     near, far = _correlations(segments, fields)
+    albedo = _albedo(segments)
     common = {b: fields[b].common_px for b in bodies}
     weight = np.ones(len(segments))
     short, long_ = 1.0, 0.0
     for _ in range(_ROUNDS):
         noise = segments.sigma_px**2 / np.maximum(weight, _LEAST_WEIGHT)
-        base = np.diag(noise) + _common(segments, common)
+        base = np.diag(noise) + _common(segments, common) + albedo
         short, long_ = _likeliest(segments.shift_px, design, base, near, far, (short, long_), fields, options)
         covariance = base + short**2 * near + long_**2 * far
         step, information, solved = _solve(segments.shift_px, design, covariance)
@@ -155,6 +156,13 @@ def _correlations(segments: Segments, fields: dict[int, Field_]) -> tuple[FloatA
     same = segments.body[:, None] == segments.body[None, :]
     scale = np.where(same, np.outer(rms, rms), 0.0)
     return scale * np.exp(-angle / reach[:, None]), scale * np.exp(-angle / np.radians(_LONG_REACH_DEG))
+
+
+def _albedo(segments: Segments) -> FloatArray:
+    """Covariance of the shifts that unknown albedo makes."""
+    gap = segments.place_vu[:, None, :] - segments.place_vu[None, :, :]
+    distance = np.hypot(gap[..., 0], gap[..., 1])
+    return np.asarray(segments.texture_px**2 * np.exp(-distance / segments.texture_reach_px))
 
 
 def _common(segments: Segments, common: dict[int, float]) -> FloatArray:

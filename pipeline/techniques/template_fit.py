@@ -14,7 +14,16 @@ from pipeline.imaging.noise import PixelNoise
 from pipeline.predict.bodies import BodyScene
 from pipeline.records import FloatArray
 from pipeline.techniques.base import NavContext
-from pipeline.techniques.body_base import Cutout, Levels, compose, cut_out, rough_levels, settled_information
+from pipeline.techniques.body_base import (
+    Cutout,
+    Levels,
+    compose,
+    cut_out,
+    rotation_lever,
+    rotation_shows,
+    rough_levels,
+    settle,
+)
 from pipeline.techniques.model_errors import (
     ModelErrorOptions,
     ModelErrors,
@@ -35,6 +44,9 @@ _STEEP = 0.08
 # width of the point spread relative to itself.
 _NIGHT_SHARE, _SKY_SLOPE_SHARE, _WIDTH_SHARE = 0.02, 0.02, 0.5
 _LEAST_VARIANCE_PX2 = 0.04
+_PROVINCE_RADII = 1.2
+# What is left of albedo of wide reach once its rise across the body is fitted.
+_LEFT_OVER = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,7 +107,7 @@ class TemplateFit:
 class _Samples:
     """Pixels, and means of blocks of smooth ones.
 
-    ``planes`` is (n, 6): data, image, along v, along u, night, widening; ``row`` and ``col`` count from the window.
+    ``planes`` is (n, 7): data, image, along v, along u, night, widening, spin; ``row`` and ``col`` count from the window.
     ``light`` and ``slope`` are the template's largest value and gradient nearby.
     """
 
@@ -109,14 +121,20 @@ class _Samples:
 
 @dataclass(frozen=True, eq=False)
 class _Solution:
-    """One weighted linear solution: changes of (dv, du[, theta], brightness, night, width, sky, slopes)."""
+    """One weighted linear solution: changes of (dv, du[, theta], brightness, night, width, sky, its slopes, albedo's).
+
+    ``lever`` is (2,), the offset that goes with a rotation which the image does not show apart from it; None where it
+    does, or where no rotation is fitted.
+    """
 
     values: FloatArray
     gram: FloatArray
+    prior: FloatArray
     design: FloatArray
     weight: FloatArray
     residual: FloatArray
     size: int
+    lever: FloatArray | None
 
 
 def fit_template(
@@ -192,7 +210,8 @@ def _sample(cutout: Cutout) -> _Samples:
     near = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (reach, reach))
     slope = np.hypot(t.along_v, t.along_u)
     held = (cv2.dilate(t.image, near), cv2.dilate(slope, near))
-    planes = (cutout.data, t.image, t.along_v, t.along_u, t.night, t.widening, *held)
+    spin = t.image if t.spin is None else t.spin
+    planes = (cutout.data, t.image, t.along_v, t.along_u, t.night, t.widening, spin, *held)
     rows, cols = cutout.good.shape
     single = cutout.good
     blocks: list[FloatArray] = []
@@ -214,7 +233,7 @@ def _sample(cutout: Cutout) -> _Samples:
     table = np.array(pixels, float)
     if blocks:
         table = np.concatenate([table, np.array(blocks, float)], axis=1)
-    return _Samples(np.ascontiguousarray(table[:6].T), *table[6:])
+    return _Samples(np.ascontiguousarray(table[:7].T), *table[7:])
 
 
 def _variance(samples: _Samples, noise: PixelNoise, levels: Levels, errors: ModelErrors) -> FloatArray:
@@ -226,17 +245,32 @@ def _variance(samples: _Samples, noise: PixelNoise, levels: Levels, errors: Mode
 
 def _design(samples: _Samples, cutout: Cutout, pivot_vu: FloatArray, scale: float, turns: bool) -> FloatArray:
     """(n, p): the image moved by d is T(x - d), so its derivative is minus the gradient."""
-    _, image, along_v, along_u, night, widening = samples.planes.T
+    _, image, along_v, along_u, night, widening, spin = samples.planes.T
     v, u = samples.row + cutout.window.v0, samples.col + cutout.window.u0
     columns = [-scale * along_v, -scale * along_u]
     if turns:
-        # d(v, u)/d theta = (u, -v) about the pivot.
-        columns.append(-scale * (along_v * (u - pivot_vu[1]) - along_u * (v - pivot_vu[0])))
+        # d(v, u)/d theta = (u, -v) about the pivot carries each body's centre; the body's own turn comes on top.
+        centre_v, centre_u = _centres(cutout, v, u)
+        carried = along_v * (centre_u - pivot_vu[1]) - along_u * (centre_v - pivot_vu[0])
+        columns.append(scale * (spin - carried))
     half = max(cutout.window.rows, cutout.window.cols) / 2
     one = np.ones(len(image))
     slope_v = (samples.row - cutout.window.rows / 2) / half
     slope_u = (samples.col - cutout.window.cols / 2) / half
-    return np.stack([*columns, image, night, scale * widening, one, slope_v, slope_u], axis=1)
+    # Albedo that rises across a body: the largest one's radius is the unit.
+    largest = max(cutout.views, key=lambda view: view.diameter_px)
+    arm_v, arm_u = (2.0 * (x - c) / largest.diameter_px for x, c in zip((v, u), largest.centre_vu, strict=True))
+    near = np.hypot(arm_v, arm_u) < _PROVINCE_RADII
+    provinces = (np.where(near, image * arm_v, 0.0), np.where(near, image * arm_u, 0.0))
+    return np.stack([*columns, image, night, scale * widening, one, slope_v, slope_u, *provinces], axis=1)
+
+
+def _centres(cutout: Cutout, v: FloatArray, u: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """(n,) row and column of the centre of the body to which each pixel is nearest, in that body's radii."""
+    gaps = [np.hypot(v - view.centre_vu[0], u - view.centre_vu[1]) / view.diameter_px for view in cutout.views]
+    nearest = np.argmin(np.array(gaps), axis=0)
+    centres = np.array([view.centre_vu for view in cutout.views])
+    return centres[nearest, 0], centres[nearest, 1]
 
 
 def _solve(
@@ -259,20 +293,21 @@ def _solve(
     pull = weighted.T @ target
     sigma2 = max(float(cutout.sigma_px) ** 2, _LEAST_VARIANCE_PX2)
     prior = np.zeros(len(gram))
+    prior[size + 6 :] = 1.0 / max(errors.wide_texture * levels.scale, 1e-30) ** 2
     prior[size + 1] = 1.0 / (_NIGHT_SHARE * levels.scale) ** 2
     prior[size + 2] = 1.0 / (_WIDTH_SHARE * sigma2) ** 2
-    prior[size + 4 :] = 1.0 / (_SKY_SLOPE_SHARE * levels.scale) ** 2
+    prior[size + 4 : size + 6] = 1.0 / (_SKY_SLOPE_SHARE * levels.scale) ** 2
     pull[size + 1] -= prior[size + 1] * levels.night
-    if turns and not _turn_shows(gram, size, context):
-        # Where the image does not show the rotation, it stays.
-        prior[2] = 1e6 * gram[2, 2] + 1e-12
+    lever = None
+    if turns:
+        block = _marginal(gram + np.diag(prior), size)
+        if not rotation_shows(block, context):
+            # Where the image does not show the rotation, it stays.
+            lever = rotation_lever(block)
+            prior[2] = 1e6 * gram[2, 2] + 1e-12
     gram = gram + np.diag(prior + 1e-12 * np.diag(gram))
     values = np.linalg.solve(gram, pull)
-    return _Solution(values, gram, design, weight, target - design @ values, size)
-
-
-def _turn_shows(gram: FloatArray, size: int, context: NavContext) -> bool:
-    return settled_information(_marginal(gram, size), context)[1]
+    return _Solution(values, gram, prior, design, weight, target - design @ values, size, lever)
 
 
 def _marginal(information: FloatArray, size: int) -> FloatArray:
@@ -310,10 +345,15 @@ def _covariance(
     photon = noise.variance(levels.sky + light) / samples.pixels
     wanted = [*range(solution.size), solution.size + 2]
     # What each sample's residual adds to the wanted parameters.
-    influence = (solution.design @ np.linalg.inv(solution.gram)[:, wanted]) * solution.weight[:, None]
-    total = (influence * photon[:, None]).T @ influence
+    inverse = np.linalg.inv(solution.gram)[:, wanted]
+    influence = (solution.design @ inverse) * solution.weight[:, None]
+    # Nuisances are off by as much as their priors say.
+    nuisances = slice(solution.size + 1, None)
+    total = (inverse[nuisances] * solution.prior[nuisances, None]).T @ inverse[nuisances]
+    total += (influence * photon[:, None]).T @ influence
     places = (samples.row, samples.col)
     total += correlated_sums(influence, errors.texture * light, places, errors.texture_px)
+    total += correlated_sums(influence, _LEFT_OVER * errors.wide_texture * light, places, errors.wide_texture_px)
     total += correlated_sums(influence, errors.relief_px * slope, places, errors.relief_reach_px)
     return np.asarray(total)
 
@@ -332,23 +372,25 @@ def _answer(
 ) -> TemplateFit | str:
     size = solution.size
     full = _covariance(samples, solution, noise, levels, errors)
-    covariance = full[:size, :size]
-    if size == 3 and not _turn_shows(solution.gram, 3, context):
-        covariance = full[:2, :2]
+    seen = size == 2 or solution.lever is None
+    covariance = full[:size, :size] if seen else full[:2, :2]
     if not np.isfinite(covariance).all() or (np.linalg.eigvalsh(covariance) <= 0).any():
         return "the fit is degenerate"
     information = np.zeros((size, size))
     information[: len(covariance), : len(covariance)] = np.linalg.inv(covariance)
-    information, _ = settled_information(information, context)
+    if solution.lever is not None:
+        # What is known is the offset that goes with each rotation.
+        bind = np.column_stack([np.eye(2), solution.lever])
+        information = bind.T @ information[:2, :2] @ bind
     weight, model = solution.weight, levels.scale * samples.planes[:, 1]
     chi2 = float((weight * solution.residual**2).mean())
     # A rendering that fits worse than all that was granted to it is as much less certain (Birge 1932).
-    information = information / max(chi2, 1.0)
+    settled = settle(information / max(chi2, 1.0), pivot, context)
     data = model + solution.residual
     dm, dd = model - np.average(model, weights=weight), data - np.average(data, weights=weight)
     power = float(np.sqrt((weight * dm**2).sum() * (weight * dd**2).sum()))
     return TemplateFit(
-        offset_vu=offset, rotation_rad=rotation, pivot_vu=pivot, information=information, scale_dn=levels.scale,
+        offset_vu=offset, rotation_rad=rotation, pivot_vu=settled.pivot_vu, information=settled.information, scale_dn=levels.scale,
         level_dn=levels.sky, night_dn=levels.night, variance_px2=float(solution.values[size + 2]),
         variance_sigma_px2=float(np.sqrt(max(full[size, size], 0.0))),
         correlation=float((weight * dm * dd).sum()) / power if power > 0 else 0.0,
