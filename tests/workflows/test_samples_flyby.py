@@ -34,7 +34,7 @@ from workflows.samples.flyby_time import (
     calendar_text,
     day_of_year_text,
     et_from_utc,
-)  # fmt: skip
+)
 
 Floats = NDArray[np.float64]
 OPTIONS = FlybyOptions(
@@ -317,6 +317,11 @@ def test_planned_frames_cover_sizes_phases_and_kinds() -> None:
     only = plan_shots(FlybyOptions(frames=20, trap_share=1.0))
     assert {shot.kind for shot in only} == set(TRAPS)
     assert all(shot.target in ("CORVETH", "HALVREN") for shot in only if shot.kind == "twins")
+
+
+def test_a_trap_that_cannot_be_laid_gives_way_to_another() -> None:
+    # At this hour the twins are in the planet's shadow.
+    assert plan_shot(1083, FlybyOptions(seed=4, frames=1084)).kind in TRAPS
 
 
 def _diameter(shot: Shot) -> float:

@@ -24,7 +24,7 @@ from workflows.samples.flyby_system import (
     moon_state,
     planet_state,
     sun_state,
-)  # fmt: skip
+)
 from workflows.samples.flyby_time import (
     LEAP_SECONDS,
     MEAN_ANOMALY,
@@ -32,7 +32,7 @@ from workflows.samples.flyby_time import (
     TDB_AMPLITUDE_S,
     TT_MINUS_TAI_S,
     Clock,
-)  # fmt: skip
+)
 
 META_KERNEL = "meta.tm"
 BARYCENTRE_ID = 0

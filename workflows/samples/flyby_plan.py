@@ -20,14 +20,13 @@ from workflows.samples.flyby_system import (
     BODIES,
     MOONS,
     PLANET,
-    PLANET_ID,
     SampleBody,
     Sighting,
     body_named,
     body_state,
     see,
     sun_state,
-)  # fmt: skip
+)
 from workflows.samples.flyby_time import (
     CASSINI_CLOCK,
     NEW_HORIZONS_CLOCK,
@@ -44,7 +43,9 @@ OFFSET_SHARE = 0.9
 SMEAR_PX = 0.03
 """Most that a target moves over the array during an exposure."""
 FASTEST_KMS = 12.0
-MAX_TRIES = 200
+MAX_TRIES = 400
+PATIENCE = 40
+"""Tries before another trap is laid."""
 PLANET_SHARE = 0.12
 COMPANION_SHARE = 0.45
 EDGE_SHARE = 0.12
@@ -319,7 +320,10 @@ def plan_shot(index: int, options: FlybyOptions) -> Shot:
     seconds = SLOT_S * (index + rng.uniform(0.1, 0.9))
     utc = whole_milliseconds(camera.spacecraft.start_utc + timedelta(seconds=seconds))
     et, exposure = et_from_utc(utc), float(rng.choice(optics.exposures_s))
-    for _ in range(MAX_TRIES):
+    for attempt in range(1, MAX_TRIES):
+        if trap is not None and attempt % PATIENCE == 0:
+            # Twins stay in the planet's shadow for hours.
+            trap = TRAPS[int(rng.integers(len(TRAPS)))]
         wish = _wish(options, optics, trap, rng)
         found = _place(wish, et, exposure, optics, options, rng)
         if found is None:
@@ -368,12 +372,7 @@ def plan_shots(options: FlybyOptions) -> list[Shot]:
     return [plan_shot(index, options) for index in range(options.frames)]
 
 
-def without_errors(shot: Shot) -> Shot:
-    """Return a shot whose a-priori attitude is the true one."""
-    return replace(shot, apriori=shot.truth, offset_vu=np.zeros(2), rotation_rad=0.0)
-
-
 def planet_relative(shot: Shot) -> tuple[FloatArray, FloatArray]:
     """Return position (km) and velocity (km/s) of a shot's spacecraft from the planet."""
-    place, velocity = body_state(next(body for body in BODIES if body.naif_id == PLANET_ID), shot.et)
+    place, velocity = body_state(PLANET, shot.et)
     return shot.position_km - place, shot.velocity_kms - velocity

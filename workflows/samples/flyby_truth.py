@@ -23,7 +23,7 @@ CONVENTION = (
     "sigmas: of the offset at the array centre, from the noise-free frame with smooth grey bodies, the photon and read "
     "noise of the pixels that carry information, an unknown brightness and background, and, where a rotation is "
     "fitted, an unknown rotation with a prior of five degrees over the root of three. target_d*_px: by how much the "
-    "target's centre lies off its predicted pixel"
+    "target's centre lies off its predicted pixel. bodies: discs that touch the array, hidden ones among them"
 )
 
 
