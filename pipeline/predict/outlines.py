@@ -13,8 +13,8 @@ from pipeline.predict.bodies import BodyView
 from pipeline.records import BoolArray, CameraModel, FloatArray, Record
 
 _FEWEST, _MOST = 48, 4000
-# Cosine of incidence from which a limb counts as lit: its brightness must rise over the noise at all.
-_LEAST_MU0 = 0.02
+# Cosine of incidence from which a limb counts as lit: nearer to the cusps slopes of the surface decide what shines.
+_LEAST_MU0 = 0.1
 # Pixels by which a place is moved to see what lies on either side of a mesh's outline.
 _BESIDE_PX = 2.0
 

@@ -10,7 +10,7 @@ from pipeline.geometry.rotations import plane_rotation, plane_rotation_derivativ
 from pipeline.imaging.render import Template, Window
 from pipeline.predict.bodies import BodyScene, BodyView
 from pipeline.records import BoolArray, FloatArray, Image
-from pipeline.techniques.base import NavContext
+from pipeline.techniques.base import NavContext, TechniqueOptions, edge_flags
 
 # A rotation whose own sigma is above this share of its bound's is told by the bound, not by the image.
 _ROTATION_SEEN = 1.0 / 3.0
@@ -200,6 +200,56 @@ def rotation_shows(information: FloatArray, context: NavContext) -> bool:
 def rotation_lever(information: FloatArray) -> FloatArray:
     """(2,) offset that goes with a rotation of -1 and leaves the image as like as it can be."""
     return np.asarray(np.linalg.pinv(information[:2, :2], rcond=1e-12, hermitian=True) @ information[:2, 2])
+
+
+def body_edge_flags(
+    settled: Settled, offset_vu: FloatArray, rotation_rad: float, context: NavContext, options: TechniqueOptions
+) -> tuple[bool, bool]:
+    """Whether an answer has run into the search's bounds.
+
+    Parameters
+    ----------
+    settled
+        Its information and pivot in the image.
+    offset_vu, rotation_rad
+        At the array centre, where the margin is defined; without a rotation the offset is known at the pivot alone, and
+        the margin there is wider by what the largest rotation adds.
+    context, options
+        Bounds, and fractions that count as their edge.
+
+    Returns
+    -------
+    tuple
+        Any bound reached; the rotation's reached.
+    """
+    if settled.observed or not context.fit_camera_rotation:
+        return edge_flags(offset_vu, rotation_rad, context, options)
+    pivot = predicted_place(context, offset_vu, rotation_rad, settled.pivot_vu)
+    there = np.abs(about(context, offset_vu, rotation_rad, pivot))
+    arm = np.abs(pivot - context.camera_model.centre_vu)[::-1]
+    bound = np.asarray(context.search_margin_vu) + context.max_rotation_rad * arm
+    return bool((there >= options.margin_at_edge_fraction * bound).any()), False
+
+
+def unexplained_share(residual: FloatArray, light: FloatArray, noise_dn: FloatArray) -> float:
+    """Share of an image's light that a rendering leaves over, noise aside.
+
+    Parameters
+    ----------
+    residual
+        (n,) image less model, DN.
+    light
+        (n,) of the model over the sky, DN.
+    noise_dn
+        (n,) 1 sigma of a pixel.
+
+    Returns
+    -------
+    float
+        Zero for a perfect rendering.
+    """
+    left = np.sqrt(np.clip((residual**2 - noise_dn**2).sum(), 0.0, None))
+    return float(left / max(float(np.sqrt((light**2).sum())), 1e-30))
 
 
 def settle(information: FloatArray, pivot_vu: FloatArray, context: NavContext) -> Settled:

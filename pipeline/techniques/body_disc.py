@@ -15,9 +15,8 @@ from pipeline.techniques.base import (
     TechniqueFailure,
     TechniqueOptions,
     TechniqueResult,
-    edge_flags,
 )
-from pipeline.techniques.body_base import about, predicted_place
+from pipeline.techniques.body_base import Settled, about, body_edge_flags, predicted_place
 from pipeline.techniques.body_minor import find_rotation, start_with_rotation
 from pipeline.techniques.body_search import Acquisition, BodySearchOptions, find_bodies
 from pipeline.techniques.model_errors import ModelErrorOptions
@@ -118,10 +117,7 @@ def _with_minor_bodies(
     scene: BodyScene, fit: TemplateFit, frame: Frame, context: NavContext, options: BodyDiscOptions
 ) -> TemplateFit | None:
     """Fit of all bodies, where the small ones are found; their rotation goes about the large ones."""
-    if fit.information[2, 2] > 0:
-        theta: float | None = 0.0
-    else:
-        theta = find_rotation(scene, fit, frame, context)
+    theta = find_rotation(scene, fit, frame, context)
     if theta is None:
         return None
     offset, rotation = start_with_rotation(fit, theta, context)
@@ -155,7 +151,8 @@ def body_disc_nav(
         return TechniqueFailure(NAME, StatusReason.NO_FEATURES_DETECTED, fix)
     fit = fix.fit
     pivot = predicted_place(context, fit.offset_vu, fit.rotation_rad, fit.pivot_vu)
-    at_edge, at_edge_rotation = edge_flags(fit.offset_vu, fit.rotation_rad, context, options)
+    settled = Settled(fit.information, fit.pivot_vu, bool(fit.information[-1, -1] > 0) and len(fit.information) == 3)
+    at_edge, at_edge_rotation = body_edge_flags(settled, fit.offset_vu, fit.rotation_rad, context, options)
     return TechniqueResult(
         technique=NAME, offset_vu=about(context, fit.offset_vu, fit.rotation_rad, pivot),
         rotation_rad=fit.rotation_rad, information=fit.information, pivot_vu=pivot,

@@ -18,12 +18,12 @@ from pipeline.techniques.base import (
     TechniqueFailure,
     TechniqueOptions,
     TechniqueResult,
-    edge_flags,
 )
 from pipeline.techniques.body_base import (
     Cutout,
     Levels,
     about,
+    body_edge_flags,
     compose,
     cut_out,
     predicted_place,
@@ -241,7 +241,7 @@ def _same_basin(start: _Start, fix: TemplateFit | None, scene: BodyScene, contex
     """Begin at the rendered fit where the limb was found about there: both settle in the same place, one sooner."""
     if fix is None:
         return start
-    places = np.array([view.centre_vu for view in scene.views])
+    places = np.array([view.centre_vu for view in scene.major().views])
     gap = _moved(places, start.offset_vu, start.rotation_rad, context) - _moved(
         places, fix.offset_vu, fix.rotation_rad, context
     )
@@ -350,7 +350,7 @@ def _result(
     information = fit.relief.information / max(fit.relief.chi2_per_segment, 1.0)
     settled = settle(information, fit.pivot_vu, context)
     pivot = predicted_place(context, fit.offset_vu, fit.rotation_rad, settled.pivot_vu)
-    at_edge, at_edge_rotation = edge_flags(fit.offset_vu, fit.rotation_rad, context, options)
+    at_edge, at_edge_rotation = body_edge_flags(settled, fit.offset_vu, fit.rotation_rad, context, options)
     radius = max(view.diameter_px for view in fit.views) / 2
     return TechniqueResult(
         technique=name, offset_vu=about(context, fit.offset_vu, fit.rotation_rad, pivot),

@@ -12,7 +12,8 @@ from pipeline.techniques.body_base import compose
 from pipeline.techniques.template_fit import TemplateFit
 
 _STEP_PX = 0.5
-_SKY_PX = 4
+# Where the large bodies show the rotation themselves, so many of its sigmas are searched.
+_SIGMAS = 5.0
 # Logarithm of the odds by which the best rotation must beat the next one, and no rotation at all.
 _SURE = 9.0
 
@@ -25,7 +26,7 @@ def find_rotation(scene: BodyScene, fit: TemplateFit, frame: Frame, context: Nav
     scene
         All bodies.
     fit
-        Of the large ones, which do not show the rotation.
+        Of the large ones.
     frame
         Image.
     context
@@ -46,6 +47,9 @@ def find_rotation(scene: BodyScene, fit: TemplateFit, frame: Frame, context: Nav
     bound = context.max_rotation_rad
     step = _STEP_PX / max(arms)
     low, high = -bound - fit.rotation_rad, bound - fit.rotation_rad
+    if fit.information[2, 2] > 0:
+        reach = _SIGMAS * float(np.sqrt(np.linalg.inv(fit.information)[2, 2])) + 2.0 * step
+        low, high = max(low, -reach), min(high, reach)
     thetas = np.linspace(low, high, int(np.clip((high - low) / step, 3, 20000)))
     gain = np.zeros(len(thetas))
     for view, stamp in zip(placed, stamps, strict=False):

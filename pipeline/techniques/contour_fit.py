@@ -144,11 +144,23 @@ def measure_segments(
     shift = values[:, 0]
     ok = dense & np.isfinite(shift) & np.isfinite(sigma) & (np.abs(shift) <= options.largest_shift_px)
     ok &= sigma <= options.largest_shift_px
-    blur2 = cutout.sigma_px**2 + _PIXEL_VARIANCE
-    reach = max(errors.texture_px, float(np.sqrt(blur2)))
-    texture = errors.texture * blur2 / reach
+    texture = _albedo_shift(errors, cutout)
+    reach = max(errors.texture_px, 1.0)
     segments = Segments(place, normal, direction, body, np.nan_to_num(shift), sigma, strength, ok, texture, reach)
     return segments if np.count_nonzero(ok) >= _FEWEST_SEGMENTS else "too few pieces of the outline show an edge"
+
+
+def _albedo_shift(errors: ModelErrors, cutout: Cutout) -> float:
+    """1 sigma of the shift of a blurred edge by albedo that varies along the normal.
+
+    An edge of width w (a Gaussian integral) under a relative brightness g moves by int(g T T') / int(T'^2): for g alike
+    over a length L < w that is tau sqrt(1.26 L w), for one alike over more it is the gradient's tau w^2 / L. Near a limb
+    the surface is foreshortened: what is alike over l on it is so over l^2 / D across the limb.
+    """
+    width = float(np.sqrt(cutout.sigma_px**2 + _PIXEL_VARIANCE))
+    diameter = max(view.diameter_px for view in cutout.views)
+    across = min(errors.texture_px, errors.texture_px**2 / diameter)
+    return errors.texture * width * min(float(np.sqrt(2.52 * across / width)), width / across)
 
 
 def _pieces(outline: Outline, usable: NDArray[np.int64], options: BandOptions) -> NDArray[np.int64]:

@@ -22,6 +22,8 @@ _ROUNDS = 3
 _FACTORS = np.array([0.3, 0.5, 0.7, 0.85, 1.0, 1.2, 1.4, 2.0, 2.8, 4.0, 8.0, 16.0, 32.0])
 _LONG_FACTORS = np.array([0.0, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0])
 _LONG_REACH_DEG = 40.0
+# Factor on the expected relief from which a wrong shape is thought of.
+_ODD_FACTOR = 1.3
 # A weight this small is an outlier's; it keeps the covariance finite.
 _LEAST_WEIGHT = 1e-4
 
@@ -207,21 +209,20 @@ def _likeliest(
     prior = -2.5 * np.log1p((np.log(_FACTORS) / width) ** 2 / 4.0)
     absent, present = np.log(1.0 - options.wrong_shape_chance), np.log(options.wrong_shape_chance)
     long_prior = np.where(_LONG_FACTORS > 0, present - np.log(len(_LONG_FACTORS) - 1), absent)
-    short, long_ = start
-    for _ in range(2):
-        short = _climb(
-            _FACTORS, short,
-            lambda k: prior[k]
-            + _restricted_likelihood(shift, design, base + _FACTORS[k] ** 2 * near + long_**2 * far),
-        )  # fmt: skip
-        previous = long_
-        long_ = _climb(
-            _LONG_FACTORS, long_,
-            lambda k: long_prior[k]
-            + _restricted_likelihood(shift, design, base + short**2 * near + _LONG_FACTORS[k] ** 2 * far),
-        )  # fmt: skip
-        if long_ == previous:
-            break
+    def score(f: float, g: float) -> float:
+        return _restricted_likelihood(shift, design, base + f**2 * near + g**2 * far)
+
+    def best_short(g: float) -> tuple[float, float]:
+        f = _climb(_FACTORS, start[0], lambda k: prior[k] + score(_FACTORS[k], g))
+        k = int(np.argmin(np.abs(_FACTORS - f)))
+        return float(prior[k]) + score(f, g), f
+
+    plain = best_short(0.0)
+    if plain[1] <= _ODD_FACTOR and start[1] == 0.0:
+        return plain[1], 0.0
+    # Reliefs far beyond what was expected: short waves and a wrong shape are weighed against each other.
+    scored = [(float(p) + s, f, float(g)) for g, p in zip(_LONG_FACTORS, long_prior, strict=True) for s, f in [best_short(float(g))]]
+    _, short, long_ = max(scored)
     return short, long_
 
 
