@@ -314,12 +314,16 @@ class BodyScene:
     def major(self) -> "BodyScene":
         """The scene without bodies much smaller than its largest one."""
         least = MINOR_SHARE * max((view.diameter_px for view in self.views), default=0.0)
-        return replace(self, views=tuple(v for v in self.views if v.diameter_px >= least), _templates={})
+        return self.only(tuple(v.body.name for v in self.views if v.diameter_px >= least))
 
-    def minor(self) -> tuple[BodyView, ...]:
+    def minor(self) -> "BodyScene":
         """What :meth:`major` leaves out."""
         kept = set(self.major().names)
-        return tuple(view for view in self.views if view.body.name not in kept)
+        return self.only(tuple(name for name in self.names if name not in kept))
+
+    def only(self, names: tuple[str, ...]) -> "BodyScene":
+        """The scene with some of its bodies."""
+        return replace(self, views=tuple(v for v in self.views if v.body.name in names), _templates={})
 
     def with_sigma(self, sigma_px: float) -> "BodyScene":
         """The same scene through another point spread."""

@@ -78,22 +78,41 @@ def find_disc(scene: BodyScene, frame: Frame, context: NavContext, options: Body
     """
     # With a rotation to be found a small body far from a large one would be lost between two samples of it.
     part = scene.major() if context.fit_camera_rotation else scene
-    found = find_bodies(part, frame, context, options.search)
-    if isinstance(found, str):
-        return found
-    fitted = _sharpened(part, frame, found.offset_vu, found.rotation_rad, context, options)
-    if isinstance(fitted, str):
-        return fitted
-    part, fit = fitted
-    drift = float(np.hypot(*(fit.offset_vu - found.offset_vu)))
-    if drift > options.largest_drift_px + 0.1 * max(view.diameter_px for view in part.views):
-        return f"the fit ran {drift:.1f} px away from the correlation's peak"
+    fix = _find_part(part, frame, context, options)
+    if isinstance(fix, str) and len(part) < len(scene):
+        # The large one may be dark or outside after all.
+        return _find_part(scene.minor(), frame, context, options)
+    if isinstance(fix, str):
+        return fix
+    part, fit, found = fix.scene, fix.fit, fix.acquisition
     if len(part) < len(scene) and context.fit_camera_rotation:
         everything = scene.with_sigma(part.sigma_px)
         whole = _with_minor_bodies(everything, fit, frame, context, options)
         if whole is not None:
             return DiscFix(found, whole, everything)
-    return DiscFix(found, fit, part)
+    return fix
+
+
+def _find_part(scene: BodyScene, frame: Frame, context: NavContext, options: BodyDiscOptions) -> DiscFix | str:
+    """Search for some bodies together and fit them."""
+    found = find_bodies(scene, frame, context, options.search)
+    if isinstance(found, str):
+        return found
+    fitted = _sharpened(scene, frame, found.offset_vu, found.rotation_rad, context, options)
+    if isinstance(fitted, str):
+        return fitted
+    sharp, fit = fitted
+    # Where the rotation is open the offset at the array centre may go far without any body moving.
+    before = _places(scene, found.offset_vu, found.rotation_rad)
+    drift = float(np.hypot(*(_places(scene, fit.offset_vu, fit.rotation_rad) - before).T).max())
+    if drift > options.largest_drift_px + 0.1 * max(view.diameter_px for view in scene.views):
+        return f"the fit ran {drift:.1f} px away from the correlation's peak"
+    return DiscFix(found, fit, sharp)
+
+
+def _places(scene: BodyScene, offset_vu: FloatArray, rotation_rad: float) -> FloatArray:
+    """(n, 2) centres of the bodies under a pointing."""
+    return np.array([view.centre_vu for view in scene.views_at(scene.attitude(offset_vu, rotation_rad))])
 
 
 def _sharpened(

@@ -37,9 +37,8 @@ def find_rotation(scene: BodyScene, fit: TemplateFit, frame: Frame, context: Nav
     float or None
         Change of the rotation, radians; None where no rotation stands out.
     """
-    minor = [view for view in scene.views if view.body.name in {m.body.name for m in scene.minor()}]
     views, _ = scene.template(*scene.quantised(fit.offset_vu, fit.rotation_rad))
-    placed = [view for view in views if view.body.name in {m.body.name for m in minor}]
+    placed = [view for view in views if view.body.name in scene.minor().names]
     stamps = [stamp for view in placed if (stamp := _stamp(view, scene)) is not None]
     arms = [float(np.hypot(*(view.centre_vu - fit.pivot_vu))) for view in placed]
     if not stamps or max(arms) < 1.0:
