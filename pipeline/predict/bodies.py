@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import Field
 
 from pipeline.camera import project
-from pipeline.geometry.ellipsoid import limb_points
+from pipeline.geometry.ellipsoid import intersect, limb_points, surface_normal
 from pipeline.geometry.pointing import corrected_attitude
 from pipeline.geometry.rotations import rotation_about
 from pipeline.imaging.illumination import law_of
@@ -31,6 +31,7 @@ from pipeline.options import Options
 from pipeline.records import Body, CameraModel, FloatArray, Image, State
 
 _LIMB_SAMPLES = 96
+_AREA_SAMPLES = 32
 # Pixels of sky that a template keeps around a body, beyond the reach of the point spread.
 _SKY_PX = 6
 # Sky around everything that a search may look at.
@@ -40,8 +41,8 @@ _CANVAS_SKY_PX = 24
 QUANTUM_PX = 0.125
 # Half the rotation between two renderings of which the difference is the derivative.
 SPIN_STEP_RAD = 0.01
-# A body smaller than this share of the largest does not help to find it.
-MINOR_SHARE = 0.35
+# A body whose lit area in the frame is below this share of the largest one's does not help to find it.
+MINOR_SHARE = 0.12
 
 
 class BodyPredictionOptions(Options):
@@ -105,6 +106,20 @@ class BodyView:
     diameter_px: float
     phase_rad: float
     px_per_km: float
+
+    def lit_area_px2(self, camera: CameraModel, window: Window) -> float:
+        """Lit area inside a window, from a grid of rays; distortion, which hardly changes an area, is left out."""
+        part = self.box.intersection(window)
+        if not part.pixels:
+            return 0.0
+        v = part.v0 - 0.5 + part.rows * (np.arange(_AREA_SAMPLES) + 0.5) / _AREA_SAMPLES
+        u = part.u0 - 0.5 + part.cols * (np.arange(_AREA_SAMPLES) + 0.5) / _AREA_SAMPLES
+        uv = np.stack(np.meshgrid(u, v), axis=2).reshape(-1, 2) - camera.principal_point_vu[::-1]
+        slopes = uv @ np.linalg.inv(camera.k_px_per_mm).T / camera.focal_length_mm
+        rays = np.column_stack([slopes, np.ones(len(slopes))]) @ self.camera_from_body
+        points, hit = intersect(self.body.radii_km, self.observer_km, rays)
+        lit = surface_normal(self.body.radii_km, points[hit]) @ self.sun_from_body > 0
+        return float(np.count_nonzero(lit)) / _AREA_SAMPLES**2 * part.pixels
 
     @property
     def observer_km(self) -> FloatArray:
@@ -206,8 +221,13 @@ class BodyScene:
 
     @property
     def pivot_vu(self) -> FloatArray:
-        """(2,) centroid of the predicted centres (seed 000)."""
-        return np.asarray(np.mean([view.centre_vu for view in self.views], axis=0))
+        """(2,) centroid of the predicted centres (seed 000), held inside the array: levers of giants would be absurd."""
+        return self.centroid(self.views)
+
+    def centroid(self, views: tuple[BodyView, ...]) -> FloatArray:
+        """(2,) centroid of bodies' centres, held inside the array."""
+        last = np.array(self.state.camera_model.shape_vu) - 1.0
+        return np.asarray(np.mean([np.clip(view.centre_vu, 0.0, last) for view in views], axis=0))
 
     def attitude(self, offset_vu: FloatArray, rotation_rad: float) -> FloatArray:
         """(3, 3) camera_from_j2000 for a correction at the array centre."""
@@ -312,9 +332,22 @@ class BodyScene:
         return cells
 
     def major(self) -> "BodyScene":
-        """The scene without bodies much smaller than its largest one."""
-        least = MINOR_SHARE * max((view.diameter_px for view in self.views), default=0.0)
-        return self.only(tuple(v.body.name for v in self.views if v.diameter_px >= least))
+        """The scene without bodies that show much less of themselves than another one."""
+        areas = self.lit_areas(self.views)
+        least = MINOR_SHARE * max(areas, default=0.0)
+        return self.only(tuple(v.body.name for v, area in zip(self.views, areas, strict=True) if area >= least))
+
+    def lit_areas(self, views: tuple[BodyView, ...]) -> list[float]:
+        """Lit areas in the array, or in the canvas where none of them reaches into the array."""
+        camera = self.state.camera_model
+        array = Window(0, 0, *camera.shape_vu)
+        areas = [view.lit_area_px2(camera, array) for view in views]
+        return areas if max(areas, default=0.0) > 0 else [view.lit_area_px2(camera, self.canvas) for view in views]
+
+    def primary(self, views: tuple[BodyView, ...]) -> BodyView:
+        """The body that shows most of itself."""
+        areas = self.lit_areas(views)
+        return views[int(np.argmax(areas))]
 
     def minor(self) -> "BodyScene":
         """What :meth:`major` leaves out."""

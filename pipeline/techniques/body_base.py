@@ -24,6 +24,10 @@ class Cutout:
     ----------
     views, template
         Bodies under the pointing at which the template was drawn.
+    primary
+        The one of them that shows most of itself.
+    pivot_vu
+        (2,) centroid of their centres, held inside the array.
     offset_vu, rotation_rad
         That pointing, at the array centre.
     sigma_px
@@ -35,6 +39,8 @@ class Cutout:
     """
 
     views: tuple[BodyView, ...]
+    primary: BodyView
+    pivot_vu: FloatArray
     template: Template
     offset_vu: FloatArray
     rotation_rad: float
@@ -54,7 +60,7 @@ class Cutout:
         return v, u
 
 
-def cut_out(scene: BodyScene, frame: Frame, offset_vu: FloatArray, rotation_rad: float) -> Cutout:
+def cut_out(scene: BodyScene, frame: Frame, offset_vu: FloatArray, rotation_rad: float) -> Cutout | None:
     """Template near a pointing, with the image's pixels under it.
 
     Parameters
@@ -68,13 +74,18 @@ def cut_out(scene: BodyScene, frame: Frame, offset_vu: FloatArray, rotation_rad:
 
     Returns
     -------
-    Cutout
-        Empty where no body reaches the array.
+    Cutout or None
+        None where no body reaches the array.
     """
     offset, rotation = scene.quantised(offset_vu, rotation_rad)
     views, template = scene.template(offset, rotation)
+    if not views or not template.window.pixels:
+        return None
     rows, cols = template.window.slices_in(Window(0, 0, *frame.raw.shape))
-    return Cutout(views, template, offset, rotation, scene.sigma_px, frame.raw[rows, cols], ~frame.bad[rows, cols])
+    primary, pivot = scene.primary(views), scene.centroid(views)
+    return Cutout(
+        views, primary, pivot, template, offset, rotation, scene.sigma_px, frame.raw[rows, cols], ~frame.bad[rows, cols]
+    )
 
 
 @dataclass(frozen=True)

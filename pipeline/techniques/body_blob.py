@@ -33,6 +33,8 @@ _ROUNDS = 4
 _SETTLED_PX = 0.02
 # Share of the template's brightest pixel from which a pixel belongs to the moment.
 _LIT_SHARE = 0.05
+# A blob is told from others by size alone.
+_SURE = 0.99
 
 
 class BodyBlobOptions(TechniqueOptions):
@@ -43,6 +45,7 @@ class BodyBlobOptions(TechniqueOptions):
     threshold_sigma: float = Field(5.0, ge=3, le=100, description="smoothed light over its noise that makes a blob")
     threshold_share: float = Field(0.1, gt=0, lt=1, description="light relative to the brightest that makes a blob")
     rival_share: float = Field(0.5, gt=0, le=1, description="light of a second blob, relative, that makes it ambiguous")
+    min_likeness: float = Field(0.7, gt=0, le=1, description="correlation with the rendering, over what noise allows")
     flux_factor: float = Field(3.0, gt=1, le=100, description="size of a blob may differ from the rendering's by this")
 
 
@@ -77,7 +80,7 @@ def body_blob_nav(
     offset, confidence = start
     for _ in range(_ROUNDS):
         cutout = cut_out(scene, frame, offset, 0.0)
-        if not cutout.views or not _whole(cutout, frame):
+        if cutout is None or not _whole(cutout, frame):
             return TechniqueFailure(NAME, StatusReason.NO_FEATURES_DETECTED, "the blob is cut by the frame or by gaps")
         moment = _moment(cutout)
         if moment is None:
@@ -88,6 +91,8 @@ def body_blob_nav(
             return TechniqueFailure(NAME, StatusReason.NO_FEATURES_DETECTED, "the blob is not of the body's shape")
         if float(np.hypot(*(offset - before))) < _SETTLED_PX:
             break
+    if _likeness(cutout) < options.min_likeness * _expected_likeness(cutout, frame, moment):
+        return TechniqueFailure(NAME, StatusReason.NO_FEATURES_DETECTED, "the blob does not look like the body")
     covariance = _covariance(cutout, frame, moment, options)
     place = moment.middle + moment.shift
     return _result(offset, covariance, place, scene, context, confidence, options)
@@ -96,7 +101,7 @@ def body_blob_nav(
 def _brightest(
     scene: BodyScene, frame: Frame, context: NavContext, options: BodyBlobOptions
 ) -> tuple[FloatArray, float] | TechniqueFailure:
-    """Offset that puts the rendering's moment onto the brightest blob, and its share of all blobs' light."""
+    """Offset that puts the rendering's moment onto the brightest blob, and how sure that is."""
     view = scene.views[0]
     rows, cols = frame.raw.shape
     reach = int(np.ceil(context.max_rotation_rad * np.abs(view.centre_vu - context.camera_model.centre_vu).max()))
@@ -138,7 +143,7 @@ def _brightest(
     tv, tu = np.indices(image.shape)
     predicted = np.array([(image * tv).sum(), (image * tu).sum()]) / max(float(image.sum()), 1e-30)
     gap = centre - predicted - [template.window.v0, template.window.u0]
-    return gap, 1.0 - 0.5 * rival / float(flux[best]) * 1e-2 - 1e-3
+    return gap, _SURE
 
 
 def _whole(cutout: Cutout, frame: Frame) -> bool:
@@ -203,6 +208,22 @@ def _moment(cutout: Cutout) -> _Moment | None:
     return _Moment(lever.T @ data, place, lever, support, scale, sky)
 
 
+def _likeness(cutout: Cutout) -> float:
+    """Correlation of image and rendering over the cutout."""
+    pair = np.stack([cutout.data[cutout.good], cutout.template.image[cutout.good]]).astype(float)
+    pair -= pair.mean(axis=1, keepdims=True)
+    power = float(np.sqrt((pair[0] ** 2).sum() * (pair[1] ** 2).sum()))
+    return float((pair[0] * pair[1]).sum()) / power if power > 0 else 0.0
+
+
+def _expected_likeness(cutout: Cutout, frame: Frame, moment: _Moment) -> float:
+    """What that correlation would be if pixels' noise were all that differs."""
+    light = moment.scale * cutout.template.image[cutout.good].astype(float)
+    noise = float(frame.noise.variance(moment.sky + light).sum())
+    signal = float(((light - light.mean()) ** 2).sum())
+    return float(np.sqrt(signal / max(signal + noise, 1e-30)))
+
+
 def _border(good: BoolArray) -> BoolArray:
     edge = np.ones_like(good)
     edge[3:-3, 3:-3] = False
@@ -220,10 +241,11 @@ def _covariance(cutout: Cutout, frame: Frame, moment: _Moment, options: BodyBlob
     sky_variance = float(frame.noise.variance(np.array(moment.sky))) * np.pi / 2.0 / max(border, 1)
     pull = lever.sum(axis=0)
     covariance += sky_variance * np.outer(pull, pull)
-    errors = assumed_errors(cutout.views, options.errors)
+    errors = assumed_errors(cutout.primary, options.errors)
     v, u = (index[support].astype(float) for index in np.indices(support.shape))
     slope = moment.scale * np.hypot(template.along_v, template.along_u)[support].astype(float)
     covariance += correlated_sums(lever, errors.texture * light, (v, u), errors.texture_px)
+    covariance += correlated_sums(lever, errors.wide_texture * light, (v, u), errors.wide_texture_px)
     covariance += correlated_sums(lever, errors.relief_px * slope, (v, u), errors.relief_reach_px)
     return np.asarray(covariance)
 

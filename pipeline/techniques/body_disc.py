@@ -34,7 +34,9 @@ class BodyDiscOptions(TechniqueOptions):
 
     search: BodySearchOptions = BodySearchOptions()
     errors: ModelErrorOptions = ModelErrorOptions()
-    min_correlation: float = Field(0.3, ge=0, lt=1, description="correlation of the fit below which it is spurious")
+    min_correlation: float = Field(
+        0.4, ge=0, lt=1, description="correlation of the fit, over what noise allows, below which it is spurious"
+    )
     largest_drift_px: float = Field(6.0, gt=0, le=100, description="how far the fit may go from where it began")
 
 
@@ -175,7 +177,8 @@ def body_disc_nav(
     return TechniqueResult(
         technique=NAME, offset_vu=about(context, fit.offset_vu, fit.rotation_rad, pivot),
         rotation_rad=fit.rotation_rad, information=fit.information, pivot_vu=pivot,
-        confidence=fix.acquisition.confidence, at_edge=at_edge, at_edge_rotation=at_edge_rotation, spurious=fit.correlation < options.min_correlation,
+        confidence=fix.acquisition.confidence, at_edge=at_edge, at_edge_rotation=at_edge_rotation,
+        spurious=fit.correlation < options.min_correlation * fit.expected_correlation,
         error_sources=tuple(f"body:{name}" for name in fix.scene.names), features=_inventory(fit, context),
         diagnostics={
             "correlation": fit.correlation, "search_correlation": fix.acquisition.correlation,

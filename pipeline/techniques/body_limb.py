@@ -131,7 +131,7 @@ def body_limb_nav(
     start = _same_basin(start, fix, scene, context)
     fields = {k: _limb_field(view, options.relief_share) for k, view in enumerate(scene.views)}
     # Of a small body the band is to hold the limb, not all of it.
-    radius = max(view.diameter_px for view in large) / 2
+    radius = scene.primary(scene.views).diameter_px / 2
     width = float(np.clip(options.band_share * radius, 2.0, options.band.half_width_px))
     band = options.band.model_copy(update={"half_width_px": width})
     fit = _fit_line(scene, frame, fix, start, context, fields, band, options.relief, options.errors, at_limb=True)
@@ -166,7 +166,7 @@ def body_terminator_nav(
     """
     if max(view.diameter_px for view in scene.views) < options.min_diameter_px:
         return TechniqueFailure(TERMINATOR, StatusReason.NO_FEATURES_PREDICTED, "no body is large enough")
-    radius = max(view.diameter_px for view in scene.views) / 2
+    radius = scene.primary(scene.views).diameter_px / 2
     width = float(np.clip(options.band_share * radius, options.band.half_width_px, 60.0))
     band = options.band.model_copy(update={"half_width_px": width})
     start = _Start(fix.offset_vu, fix.rotation_rad, min(confidence, _FOLLOWER), fix.correlation)
@@ -285,7 +285,7 @@ def _fit_line(
     fixed_turn = not context.fit_camera_rotation
     for _ in range(_ROUNDS):
         cutout = cut_out(scene, frame, offset, rotation)
-        if not cutout.views or not cutout.good.any():
+        if cutout is None or not cutout.good.any():
             return "the body is outside the frame"
         camera = context.camera_model
         if at_limb:
@@ -296,7 +296,7 @@ def _fit_line(
         levels = _levels(cutout, fix)
         if not levels.scale > 0:
             return "the image is not bright where the body is"
-        errors = fix.errors if fix is not None else assumed_errors(cutout.views, error_options)
+        errors = fix.errors if fix is not None else assumed_errors(cutout.primary, error_options)
         segments = measure_segments(cutout, outline, frame, levels, errors, band)
         if isinstance(segments, str):
             return segments

@@ -158,7 +158,7 @@ def _albedo_shift(errors: ModelErrors, cutout: Cutout) -> float:
     the surface is foreshortened: what is alike over l on it is so over l^2 / D across the limb.
     """
     width = float(np.sqrt(cutout.sigma_px**2 + _PIXEL_VARIANCE))
-    diameter = max(view.diameter_px for view in cutout.views)
+    diameter = cutout.primary.diameter_px
     across = min(errors.texture_px, errors.texture_px**2 / diameter)
     return errors.texture * width * min(float(np.sqrt(2.52 * across / width)), width / across)
 

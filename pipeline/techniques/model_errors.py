@@ -44,6 +44,9 @@ class ModelErrors:
         Relative rms and reach.
     wide_texture, wide_texture_px
         The same of provinces as large as hemispheres, which no single image can tell from the body's shading.
+    shading
+        1 sigma of the brightness that slopes of the surface change, relative to the template's unit; it does not fade
+        toward the terminator as albedo does.
     relief_px, relief_reach_px
         1 sigma along the gradient and reach along the surface.
     """
@@ -52,17 +55,18 @@ class ModelErrors:
     texture_px: float
     wide_texture: float
     wide_texture_px: float
+    shading: float
     relief_px: float
     relief_reach_px: float
 
 
-def assumed_errors(views: tuple[BodyView, ...], options: ModelErrorOptions) -> ModelErrors:
-    """Errors before the image is looked at, for the largest of some bodies.
+def assumed_errors(view: BodyView, options: ModelErrorOptions) -> ModelErrors:
+    """Errors before the image is looked at.
 
     Parameters
     ----------
-    views
-        Bodies.
+    view
+        The body that shows most of itself.
     options
         Assumptions.
 
@@ -71,18 +75,18 @@ def assumed_errors(views: tuple[BodyView, ...], options: ModelErrorOptions) -> M
     ModelErrors
         In pixels at the body's distance.
     """
-    view = max(views, key=lambda view: view.diameter_px)
     radius = view.diameter_px / 2
     sigma_km = view.body.shape_sigma_km
     relief = options.relief_share * radius if sigma_km is None else sigma_km * view.px_per_km
     reach = float(np.radians(view.body.shape_correlation_deg)) * radius
     narrow, wide = (max(share * radius, 1.0) for share in (options.texture_reach, options.wide_reach))
-    return ModelErrors(options.texture, narrow, options.wide_share * options.texture, wide, relief, max(reach, 1.0))
+    return ModelErrors(options.texture, narrow, options.wide_share * options.texture, wide, 0.0, relief, max(reach, 1.0))
 
 
 def measured_errors(
     excess: FloatArray,
     residual: FloatArray,
+    scale_dn: float,
     light: FloatArray,
     slope: FloatArray,
     good: BoolArray,
@@ -97,6 +101,8 @@ def measured_errors(
         (rows, cols) squared residual less the variance of a pixel's noise.
     residual
         (rows, cols) image less model, DN.
+    scale_dn
+        Brightness of the template's unit.
     light, slope
         (rows, cols) DN of the template, and length of its gradient, DN per pixel.
     good
@@ -121,6 +127,11 @@ def measured_errors(
         patches = np.count_nonzero(face) / max(2.0 * np.pi * reach**2, 1.0)
     dof = options.texture_dof
     texture = float(np.sqrt((dof * options.texture**2 + patches * rms**2) / max(dof + patches, 1e-9)))
+    dusk = good & (light > 0.005 * brightest) & (light < 0.25 * brightest) & (slope < 0.25 * steepest)
+    shading = 0.0
+    if np.count_nonzero(dusk) > _FEWEST_PIXELS:
+        left = float((excess[dusk] - (texture * light[dusk]) ** 2).mean())
+        shading = float(np.sqrt(max(left, 0.0))) / scale_dn
     edge = good & (slope > 0.5 * steepest)
     relief2 = 0.0
     if np.count_nonzero(edge) > _FEWEST_PIXELS:
@@ -128,7 +139,7 @@ def measured_errors(
         relief2 = float(np.median(left) / _MEDIAN_SQUARE / np.median(slope[edge] ** 2))
     relief = max(assumed.relief_px, float(np.sqrt(max(relief2, 0.0))))
     wide = options.wide_share * texture
-    return replace(assumed, texture=texture, texture_px=reach, wide_texture=wide, relief_px=relief)
+    return replace(assumed, texture=texture, texture_px=reach, wide_texture=wide, shading=shading, relief_px=relief)
 
 
 def _reach(ratio: FloatArray, inside: BoolArray, rms: float, default: float) -> float:

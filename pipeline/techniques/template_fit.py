@@ -67,8 +67,8 @@ class TemplateFit:
         Brightness of night sides.
     variance_px2, variance_sigma_px2
         By how much the point spread's variance should grow, and its sigma.
-    correlation
-        Of image and template, weighted.
+    correlation, expected_correlation
+        Of image and template, weighted, and what it would be if noise were all that differs.
     chi2_per_sample
         With all of the model's errors.
     errors
@@ -87,6 +87,7 @@ class TemplateFit:
     variance_px2: float
     variance_sigma_px2: float
     correlation: float
+    expected_correlation: float
     chi2_per_sample: float
     errors: ModelErrors
     cutout: Cutout
@@ -168,11 +169,11 @@ def fit_template(
     errors: ModelErrors | None = None
     for _ in range(_ROUNDS):
         cutout = cut_out(scene, frame, offset, rotation)
-        if not cutout.views or np.count_nonzero(cutout.good) < 16:
+        if cutout is None or np.count_nonzero(cutout.good) < 16:
             return "too few pixels"
-        pivot = np.mean([view.centre_vu for view in cutout.views], axis=0)
+        pivot = cutout.pivot_vu
         levels = levels or rough_levels(cutout)
-        errors = errors or assumed_errors(cutout.views, options)
+        errors = errors or assumed_errors(cutout.primary, options)
         if not levels.scale > 0:
             return "the image is not bright where the template is"
         samples = _sample(cutout)
@@ -240,7 +241,8 @@ def _variance(samples: _Samples, noise: PixelNoise, levels: Levels, errors: Mode
     light = levels.scale * samples.light
     relief = levels.scale * errors.relief_px * samples.slope
     photon = noise.variance(levels.sky + light) / samples.pixels
-    return np.asarray(photon + (errors.texture * light) ** 2 + relief**2)
+    shading = np.where(samples.light > 0, errors.shading * levels.scale, 0.0)
+    return np.asarray(photon + (errors.texture * light) ** 2 + shading**2 + relief**2)
 
 
 def _design(samples: _Samples, cutout: Cutout, pivot_vu: FloatArray, scale: float, turns: bool) -> FloatArray:
@@ -258,7 +260,7 @@ def _design(samples: _Samples, cutout: Cutout, pivot_vu: FloatArray, scale: floa
     slope_v = (samples.row - cutout.window.rows / 2) / half
     slope_u = (samples.col - cutout.window.cols / 2) / half
     # Albedo that rises across a body: the largest one's radius is the unit.
-    largest = max(cutout.views, key=lambda view: view.diameter_px)
+    largest = cutout.primary
     arm_v, arm_u = (2.0 * (x - c) / largest.diameter_px for x, c in zip((v, u), largest.centre_vu, strict=True))
     near = np.hypot(arm_v, arm_u) < _PROVINCE_RADII
     provinces = (np.where(near, image * arm_v, 0.0), np.where(near, image * arm_u, 0.0))
@@ -332,7 +334,7 @@ def _look(
     excess = residual**2 - noise.variance(levels.sky + light)
     slope = levels.scale * _slope_length(cutout)
     return measured_errors(
-        excess, residual, light, slope, cutout.good, assumed_errors(cutout.views, options), options
+        excess, residual, levels.scale, light, slope, cutout.good, assumed_errors(cutout.primary, options), options
     )
 
 
@@ -354,6 +356,8 @@ def _covariance(
     places = (samples.row, samples.col)
     total += correlated_sums(influence, errors.texture * light, places, errors.texture_px)
     total += correlated_sums(influence, _LEFT_OVER * errors.wide_texture * light, places, errors.wide_texture_px)
+    lit = np.where(samples.planes[:, 1] > 0, errors.shading * levels.scale, 0.0)
+    total += correlated_sums(influence, lit, places, errors.texture_px)
     total += correlated_sums(influence, errors.relief_px * slope, places, errors.relief_reach_px)
     return np.asarray(total)
 
@@ -389,10 +393,13 @@ def _answer(
     data = model + solution.residual
     dm, dd = model - np.average(model, weights=weight), data - np.average(data, weights=weight)
     power = float(np.sqrt((weight * dm**2).sum() * (weight * dd**2).sum()))
+    signal = float((weight * dm**2).sum())
+    grain = float((weight * noise.variance(levels.sky + model) / samples.pixels).sum())
     return TemplateFit(
         offset_vu=offset, rotation_rad=rotation, pivot_vu=settled.pivot_vu, information=settled.information, scale_dn=levels.scale,
         level_dn=levels.sky, night_dn=levels.night, variance_px2=float(solution.values[size + 2]),
         variance_sigma_px2=float(np.sqrt(max(full[size, size], 0.0))),
         correlation=float((weight * dm * dd).sum()) / power if power > 0 else 0.0,
+        expected_correlation=float(np.sqrt(signal / max(signal + grain, 1e-30))),
         chi2_per_sample=chi2, errors=errors, cutout=cutout,
     )  # fmt: skip
