@@ -319,30 +319,48 @@ def _spacecraft(names: SpiceNames, et: float, utc: str) -> Spacecraft:
     return Spacecraft(state[:3], state[3:])
 
 
-def _bodies_in_field(state: State, names: SpiceNames, known: Sequence[Candidate], models: BodyModels) -> Iterator[Body]:
-    """Bodies whose disc reaches into the field widened by the search margin."""
+def _bodies_in_field(
+    state: State, names: SpiceNames, known: Sequence[Candidate], models: BodyModels
+) -> Iterator[Body]:
+    """Bodies whose disc reaches into the field widened by the search margin, and those that may shade one of them."""
     axis, half = field_of_view(state.camera_model, reach_px(state))
     direction = state.attitude.camera_from_j2000.T @ axis
-    for candidate in known:
-        try:
-            place, light_time = spiceypy.spkezp(candidate.naif_id, state.et, _J2000, CORRECTION, names.spacecraft_id)
-        except SpiceyError:
-            # Ephemerides of moons often cover less than the mission.
-            continue
-        position = np.array(place)
-        block = models.block_of(candidate.name)
-        reach = _MESH_REACH if block.shape else 1.0
-        size = reach * float(candidate.radii_km.max()) + _HAZE_REACH * block.haze_km
-        distance = float(np.linalg.norm(position))
-        if distance <= size or _separation(direction, position) <= half + np.arcsin(size / distance):
-            orientation = _orientation(candidate, state.et - light_time)
-            if orientation is None:
-                continue
-            sun = _direction_to_sun(candidate.naif_id, state.et - light_time)
-            numbered = block.model_copy(update={"naif_id": candidate.naif_id})
-            yield numbered.body(
-                candidate.name, position, orientation, sun, candidate.radii_km, models.mesh_of(block)
-            )  # fmt: skip
+    bodies = [body for candidate in known if (body := _seen(candidate, state, names, models)) is not None]
+    inside = [body for body in bodies if _reaches(body, direction, half)]
+    for body in bodies:
+        if any(body is other for other in inside) or any(_may_shade(body, other) for other in inside):
+            yield body
+
+
+def _seen(candidate: Candidate, state: State, names: SpiceNames, models: BodyModels) -> Body | None:
+    """Body as the spacecraft sees it, None where the kernels do not cover it then: those of moons often cover less."""
+    try:
+        place, light_time = spiceypy.spkezp(candidate.naif_id, state.et, _J2000, CORRECTION, names.spacecraft_id)
+    except SpiceyError:
+        return None
+    orientation = _orientation(candidate, state.et - light_time)
+    if orientation is None:
+        return None
+    block = models.block_of(candidate.name).model_copy(update={"naif_id": candidate.naif_id})
+    sun = _direction_to_sun(candidate.naif_id, state.et - light_time)
+    return block.body(candidate.name, np.array(place), orientation, sun, candidate.radii_km, models.mesh_of(block))
+
+
+def _reaches(body: Body, direction: FloatArray, half_rad: float) -> bool:
+    """Whether a body's disc comes into a cone."""
+    reach = _MESH_REACH if body.mesh is not None else 1.0
+    size = reach * float(body.radii_km.max()) + _HAZE_REACH * body.haze_km
+    distance = float(np.linalg.norm(body.position_km))
+    inside = distance <= size
+    return inside or _separation(direction, body.position_km) <= half_rad + float(np.arcsin(size / distance))
+
+
+def _may_shade(body: Body, other: Body) -> bool:
+    """Whether a body stands between another and the Sun, by their spheres."""
+    gap = body.position_km - other.position_km
+    along = float(gap @ other.sun_direction_j2000)
+    aside = float(np.linalg.norm(gap - along * other.sun_direction_j2000))
+    return body is not other and along > 0 and aside < float(body.radii_km.max() + other.radii_km.max())
 
 
 def _separation(a: FloatArray, b: FloatArray) -> float:

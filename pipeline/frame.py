@@ -9,7 +9,7 @@ from pydantic import Field
 
 from pipeline.errors import ImageError
 from pipeline.imaging.background import Background, BackgroundOptions, estimate_background, estimate_gain
-from pipeline.imaging.masks import missing_pixels, saturated_pixels
+from pipeline.imaging.masks import missing_pixels, saturated_pixels, spikes
 from pipeline.imaging.noise import PixelNoise, pixel_noise
 from pipeline.imaging.psf import PointSpread
 from pipeline.options import Options
@@ -17,6 +17,10 @@ from pipeline.records import BoolArray, CameraModel, Detector, FloatArray, Image
 from pipeline.status import StatusReason
 
 _EIGHT_BIT_MAX = 255
+# So many pixels at exactly 2^n - 1 are a converter's end and no chance.
+_FULL_PIXELS = 4
+# Noise alone makes one such pixel in a thousand million.
+_SPIKE_SIGMA = 8.0
 # An ideal quantiser adds a twelfth of its step squared to the variance.
 _QUANTISATION_SIGMA = 1.0 / np.sqrt(12.0)
 
@@ -181,6 +185,24 @@ def without_light_of(covered: BoolArray, frame: Frame, state: State, options: Fr
     return replace(frame, pixels=pixels, sigma=background.sigma, bad=bad, saturated=saturated)
 
 
+def without_spikes(frame: Frame) -> Frame:
+    """The same frame with single struck pixels bad, which for bodies are nothing but disturbance.
+
+    Parameters
+    ----------
+    frame
+        Of :func:`make_frame`.
+
+    Returns
+    -------
+    Frame
+        For techniques on bodies; stars would lose their cores.
+    """
+    sigma = np.sqrt(frame.noise.variance(frame.raw)).astype(np.float32)
+    struck = spikes(frame.raw, frame.bad, sigma, _SPIKE_SIGMA)
+    return replace(frame, bad=frame.bad | struck) if struck.any() else frame
+
+
 def _read_noise(detector: Detector, integral: bool) -> float | None:
     """Declared noise without light, with the rounding to whole numbers; None where nobody declares it."""
     if detector.read_noise_dn is None:
@@ -200,10 +222,14 @@ def _check_shape(pixels: Image, camera: CameraModel) -> None:
 
 
 def _saturation(detector: Detector, pixels: Image) -> float | None:
-    """Declared saturation, else the end of an 8-bit range, where real images do saturate."""
-    if detector.saturation_dn is None and pixels.dtype.kind == "u" and pixels.dtype.itemsize == 1:
+    """Declared saturation, else the end of an integer range at which several pixels stand."""
+    if detector.saturation_dn is not None or pixels.dtype.kind not in "iu":
+        return detector.saturation_dn
+    if pixels.dtype.itemsize == 1:
         return float(_EIGHT_BIT_MAX)
-    return detector.saturation_dn
+    top = int(pixels.max())
+    full = top >= _EIGHT_BIT_MAX and (top & (top + 1)) == 0
+    return float(top) if full and np.count_nonzero(pixels == top) >= _FULL_PIXELS else None
 
 
 def _finite(image: Image) -> tuple[Image, BoolArray | None]:

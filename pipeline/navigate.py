@@ -8,7 +8,7 @@ from pydantic import Field
 
 from pipeline.ensemble import EnsembleOptions, _CombinedEstimate, ensemble
 from pipeline.errors import ImageFailure
-from pipeline.frame import Frame, FrameOptions, make_frame, without_light_of
+from pipeline.frame import Frame, FrameOptions, make_frame, without_light_of, without_spikes
 from pipeline.imaging.detect import DetectionOptions, detect_point_sources
 from pipeline.options import Options
 from pipeline.predict.bodies import BodyFate, BodyPredictionOptions, BodyScene, predict_bodies
@@ -128,9 +128,10 @@ def navigate(
     outcomes: list[_Outcome] = []
     star_frame = frame
     if len(scene):
-        fix = _find(scene, frame, context, options.techniques)
+        body_frame = without_spikes(frame)
+        fix = _find(scene, body_frame, context, options.techniques)
         on_stage("body_disc")
-        outcomes += _body_pass(scene, frame, fix, context, options.techniques, on_stage)
+        outcomes += _body_pass(scene, body_frame, fix, context, options.techniques, on_stage)
         if len(predicted):
             star_frame = without_light_of(_lit_pixels(scene, fix, frame), frame, state, options.frame)
             on_stage("body_mask")

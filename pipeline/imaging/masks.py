@@ -1,6 +1,7 @@
 """Which pixels carry no measurement: never received, saturated."""
 
 import cv2
+import numba
 import numpy as np
 
 from pipeline.records import BoolArray, Image
@@ -79,4 +80,54 @@ def saturated_pixels(image: Image, saturation_dn: float | None, read_noise_dn: f
     slack = _SATURATION_NOISE_SIGMA * (read_noise_dn or 0.0)
     # At most a tenth of the range: a noisy camera must not lose its upper half.
     result: BoolArray = image >= saturation_dn - min(slack, 0.1 * abs(saturation_dn))
+    return result
+
+
+@numba.njit(cache=True, nogil=True)
+def _mark_spikes(image, bad, sigma, least_sigma, result):  # type: ignore[no-untyped-def]
+    rows, cols = image.shape
+    for i in range(1, rows - 1):
+        for j in range(1, cols - 1):
+            here = image[i, j]
+            if bad[i, j] or here <= image[i, j - 1] or here < image[i - 1, j] or here <= image[i + 1, j]:
+                continue
+            lowest = here
+            for a in range(-1, 2):
+                for b in range(-1, 2):
+                    lowest = min(lowest, image[i + a, j + b])
+            rise = here - lowest
+            if rise < least_sigma * sigma[i, j]:
+                continue
+            alike, v, u = 0, i, j
+            for a in range(-1, 2):
+                for b in range(-1, 2):
+                    if (a or b) and image[i + a, j + b] - lowest > 0.4 * rise:
+                        alike, v, u = alike + 1, i + a, j + b
+            if alike <= 1:
+                result[i, j] = result[v, u] = True
+
+
+def spikes(image: Image, bad: BoolArray, sigma_dn: Image, least_sigma: float) -> BoolArray:
+    """Single bright pixels, or pairs: cosmic rays and hot pixels, which no optics make.
+
+    A sharp star can be among them; a crescent one pixel wide is not, for it goes on on both sides.
+
+    Parameters
+    ----------
+    image
+        (rows, cols) DN.
+    bad
+        (rows, cols) pixels known to be bad.
+    sigma_dn
+        (rows, cols) noise.
+    least_sigma
+        Rise over the surroundings from which a pixel may be one.
+
+    Returns
+    -------
+    numpy.ndarray
+        (rows, cols) True where struck.
+    """
+    result = np.zeros(image.shape, np.bool_)
+    _mark_spikes(image, bad, sigma_dn, least_sigma, result)
     return result

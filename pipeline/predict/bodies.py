@@ -107,19 +107,33 @@ class BodyView:
     phase_rad: float
     px_per_km: float
 
-    def lit_area_px2(self, camera: CameraModel, window: Window) -> float:
-        """Lit area inside a window, from a grid of rays; distortion, which hardly changes an area, is left out."""
+    def lit_area_px2(
+        self, camera: CameraModel, window: Window, others: "tuple[BodyView, ...]"
+    ) -> tuple[float, set[str]]:
+        """Lit area inside a window and not hidden by nearer bodies, and the names of those that hide some of it.
+
+        From a grid of rays; distortion, which hardly changes an area, is left out.
+        """
         part = self.box.intersection(window)
         if not part.pixels:
-            return 0.0
+            return 0.0, set()
         v = part.v0 - 0.5 + part.rows * (np.arange(_AREA_SAMPLES) + 0.5) / _AREA_SAMPLES
         u = part.u0 - 0.5 + part.cols * (np.arange(_AREA_SAMPLES) + 0.5) / _AREA_SAMPLES
         uv = np.stack(np.meshgrid(u, v), axis=2).reshape(-1, 2) - camera.principal_point_vu[::-1]
         slopes = uv @ np.linalg.inv(camera.k_px_per_mm).T / camera.focal_length_mm
         rays = np.column_stack([slopes, np.ones(len(slopes))]) @ self.camera_from_body
         points, hit = intersect(self.body.radii_km, self.observer_km, rays)
-        lit = surface_normal(self.body.radii_km, points[hit]) @ self.sun_from_body > 0
-        return float(np.count_nonzero(lit)) / _AREA_SAMPLES**2 * part.pixels
+        lit = np.zeros(len(rays), bool)
+        lit[hit] = surface_normal(self.body.radii_km, points[hit]) @ self.sun_from_body > 0
+        in_camera = rays @ self.camera_from_body.T
+        hiders = set()
+        for other in others:
+            if other is not self and np.linalg.norm(other.centre_km) < np.linalg.norm(self.centre_km):
+                hidden = intersect(other.body.radii_km, other.observer_km, in_camera @ other.camera_from_body)[1]
+                if (hidden & hit).any():
+                    hiders.add(other.body.name)
+                lit &= ~hidden
+        return float(np.count_nonzero(lit)) / _AREA_SAMPLES**2 * part.pixels, hiders
 
     @property
     def observer_km(self) -> FloatArray:
@@ -327,27 +341,32 @@ class BodyScene:
             if is_mesh:
                 render_meshes(cells, [_mesh_solid(view, self.state.camera_model) for view in run], window)
             else:
-                solids = [_solid(view, views) for view in run]
+                solids = [_solid(view, self.state.bodies) for view in run]
                 render_cells(cells, solids, self.rays, window, [view.box for view in run], inner)
         return cells
 
     def major(self) -> "BodyScene":
-        """The scene without bodies that show much less of themselves than another one."""
+        """The scene without bodies that show much less of themselves than another one, unless they hide some of it."""
         areas = self.lit_areas(self.views)
-        least = MINOR_SHARE * max(areas, default=0.0)
-        return self.only(tuple(v.body.name for v, area in zip(self.views, areas, strict=True) if area >= least))
+        least = MINOR_SHARE * max((area for area, _ in areas), default=0.0)
+        kept = [k for k, (area, _) in enumerate(areas) if area >= least and area > 0]
+        names = {self.views[k].body.name for k in kept}.union(*(areas[k][1] for k in kept))
+        return self.only(tuple(name for name in self.names if name in names)) if names else self
 
-    def lit_areas(self, views: tuple[BodyView, ...]) -> list[float]:
-        """Lit areas in the array, or in the canvas where none of them reaches into the array."""
+    def lit_areas(self, views: tuple[BodyView, ...]) -> list[tuple[float, set[str]]]:
+        """Lit areas in the array, or in the canvas where none of them reaches into the array; and who hides them."""
         camera = self.state.camera_model
         array = Window(0, 0, *camera.shape_vu)
-        areas = [view.lit_area_px2(camera, array) for view in views]
-        return areas if max(areas, default=0.0) > 0 else [view.lit_area_px2(camera, self.canvas) for view in views]
+        areas = [view.lit_area_px2(camera, array, views) for view in views]
+        if max((area for area, _ in areas), default=0.0) > 0:
+            return areas
+        return [view.lit_area_px2(camera, self.canvas, views) for view in views]
 
     def primary(self, views: tuple[BodyView, ...]) -> BodyView:
         """The body that shows most of itself."""
-        areas = self.lit_areas(views)
-        return views[int(np.argmax(areas))]
+        if len(views) == 1:
+            return views[0]
+        return views[int(np.argmax([area for area, _ in self.lit_areas(views)]))]
 
     def minor(self) -> "BodyScene":
         """What :meth:`major` leaves out."""
@@ -397,23 +416,28 @@ def form_of(view: BodyView) -> FloatArray:
     return np.asarray(rotation @ np.diag(1.0 / view.body.radii_km**2) @ rotation.T)
 
 
-def _solid(view: BodyView, others: tuple[BodyView, ...]) -> Solid:
+def _solid(view: BodyView, bodies: tuple[Body, ...]) -> Solid:
+    """Body for the renderer, with whatever of the State may shade it, in the field or not."""
     law, parameter = law_of(view.body.photometry, view.body.photometry_parameter, view.phase_rad)
-    shading = [
-        np.concatenate([other.centre_km, form_of(other).ravel()])
-        for other in others
-        if other is not view and _may_shadow(other, view)
-    ]
+    shading = [_occluder(other, view) for other in bodies if other.name != view.body.name and _may_shade(other, view.body)]
     occluders = np.array(shading).reshape(-1, 12)
     return Solid(view.centre_km, form_of(view), view.sun, law, parameter, 1.0, occluders)
 
 
-def _may_shadow(near_sun: BodyView, view: BodyView) -> bool:
+def _may_shade(other: Body, body: Body) -> bool:
     """Whether a body stands between another and the Sun, by their spheres."""
-    gap = near_sun.centre_km - view.centre_km
-    along = float(gap @ view.sun)
-    aside = float(np.linalg.norm(gap - along * view.sun))
-    return along > 0 and aside < near_sun.body.radii_km.max() + view.body.radii_km.max()
+    gap = other.position_km - body.position_km
+    along = float(gap @ body.sun_direction_j2000)
+    aside = float(np.linalg.norm(gap - along * body.sun_direction_j2000))
+    return along > 0 and aside < float(other.radii_km.max() + body.radii_km.max())
+
+
+def _occluder(other: Body, view: BodyView) -> FloatArray:
+    """(12,) centre and rows of the form of a shading body, in the frame of the body that it shades."""
+    camera_from_j2000 = view.camera_from_body @ view.body.body_from_j2000
+    rotation = camera_from_j2000 @ other.body_from_j2000.T
+    form = rotation @ np.diag(1.0 / other.radii_km**2) @ rotation.T
+    return np.concatenate([camera_from_j2000 @ other.position_km, form.ravel()])
 
 
 def _mesh_solid(view: BodyView, camera: CameraModel) -> MeshSolid:

@@ -23,6 +23,7 @@ from pipeline.techniques.model_errors import ModelErrors
 
 _FEWEST_SEGMENTS = 4
 _FEWEST_PIXELS = 6
+_LEAST_MEASURED = 0.8
 # Variance of a place inside a pixel.
 _PIXEL_VARIANCE = 1.0 / 12.0
 
@@ -121,9 +122,16 @@ def measure_segments(
     pixels = _band(cutout, outline, usable, options.half_width_px + 2.0 * cutout.sigma_px)
     if pixels is None:
         return "no measured pixel near the outline"
-    row, col, vertex = pixels
-    group = piece[vertex]
     count = int(piece.max()) + 1
+    row, col, vertex = pixels
+    # Where much of the band is full or missing, what is left of an edge says little of where it is.
+    total = np.bincount(piece[vertex], minlength=count)
+    measured = cutout.good[row, col]
+    row, col, vertex = row[measured], col[measured], vertex[measured]
+    if not len(row):
+        return "no measured pixel near the outline"
+    group = piece[vertex]
+    whole = np.bincount(group, minlength=count) >= _LEAST_MEASURED * total
     place, normal, direction, body = _middles(outline, usable, piece, count)
     template = cutout.template
     near = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * int(np.ceil(2 * cutout.sigma_px)) + 1,) * 2)
@@ -142,7 +150,7 @@ def measure_segments(
     sigma = np.sqrt(np.maximum(covariance[:, 0, 0], 1e-12) * excess)
     strength = (1.0 + values[:, 1]) / np.sqrt(np.maximum(covariance[:, 1, 1] * excess, 1e-12))
     shift = values[:, 0]
-    ok = dense & np.isfinite(shift) & np.isfinite(sigma) & (np.abs(shift) <= options.largest_shift_px)
+    ok = dense & whole & np.isfinite(shift) & np.isfinite(sigma) & (np.abs(shift) <= options.largest_shift_px)
     ok &= sigma <= options.largest_shift_px
     texture = _albedo_shift(errors, cutout)
     reach = max(errors.texture_px, 1.0)
@@ -182,7 +190,7 @@ def _pieces(outline: Outline, usable: NDArray[np.int64], options: BandOptions) -
 def _band(
     cutout: Cutout, outline: Outline, usable: NDArray[np.int64], half_width: float
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]] | None:
-    """Rows and columns in the cutout of good pixels near the outline, and the usable vertex nearest to each."""
+    """Rows and columns in the cutout of pixels near the outline, and the usable vertex nearest to each."""
     window = cutout.window
     local = np.rint(outline.vertices_vu - [window.v0, window.u0]).astype(int)
     rows, cols = cutout.good.shape
@@ -200,7 +208,7 @@ def _band(
     rank[usable] = np.arange(len(usable))
     vertex = np.flatnonzero(inside)
     owner[label[local[vertex, 0], local[vertex, 1]]] = rank[vertex]
-    row, col = np.nonzero((distance <= half_width) & cutout.good)
+    row, col = np.nonzero(distance <= half_width)
     nearest = owner[label[row, col]]
     kept = nearest >= 0
     return (row[kept], col[kept], nearest[kept]) if kept.any() else None
