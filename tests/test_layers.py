@@ -27,10 +27,13 @@ LEVELS = (
 # Within a folder: modules that the others of it may import, lowest first. All others are equals.
 FOUNDATIONS = {
     "geometry": ("rotations",),
-    "imaging": ("psf",),
-    "predict": (),
-    "techniques": ("base", "star_fit", "star_match", "star_search", "star_inventory"),
-}
+    "imaging": ("psf", "illumination", "render"),
+    "predict": ("bodies",),
+    "techniques": (
+        "base", "star_fit", "star_match", "star_search", "star_inventory", "body_base", "body_search", "model_errors",
+        "template_fit", "body_minor", "contour_fit", "lm", "line_search", "relief",
+    ),
+}  # fmt: skip
 OUTSIDE_OF_SCIENCE = {
     "catalogs", "workflows", "dask", "distributed", "spiceypy", "astropy", "erfa", "fsspec", "duckdb", "pandas", "yaml",
     "typer", "rich", "os", "pathlib", "time", "datetime", "io", "glob", "shutil", "tempfile", "subprocess", "random",
