@@ -154,7 +154,8 @@ def intersect(radii_km: FloatArray, observer_km: FloatArray, rays: FloatArray) -
     a = (along**2).sum(axis=1)
     b = along @ start
     c = start @ start - 1.0
-    root2 = b * b - a * c
+    # b^2 - a c by Lagrange's identity: far away the two terms agree in all of their digits.
+    root2 = a - (np.cross(along, start) ** 2).sum(axis=1)
     hit = (root2 >= 0) & (b < 0)
     # c / (-b + root) is the near root without the difference of two nearly equal numbers.
     near = c / np.where(hit, -b + np.sqrt(np.where(hit, root2, 0.0)), np.nan)

@@ -94,8 +94,8 @@ def _heights(heights, places, height, facets):  # type: ignore[no-untyped-def]
         area = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
         if area <= 0.0:
             continue
-        for x in range(max(0, int(ceil(min(ax, bx, cx)))), min(heights.shape[0] - 1, int(max(ax, bx, cx))) + 1):
-            for y in range(max(0, int(ceil(min(ay, by, cy)))), min(heights.shape[1] - 1, int(max(ay, by, cy))) + 1):
+        for x in range(max(0, ceil(min(ax, bx, cx))), min(heights.shape[0] - 1, int(max(ax, bx, cx))) + 1):
+            for y in range(max(0, ceil(min(ay, by, cy))), min(heights.shape[1] - 1, int(max(ay, by, cy))) + 1):
                 p = ((bx - x) * (cy - y) - (by - y) * (cx - x)) / area
                 q = ((cx - x) * (ay - y) - (cy - y) * (ax - x)) / area
                 r = 1.0 - p - q
@@ -132,9 +132,9 @@ def _fill(cells, cover, depth, places, points, facets, light, shadow, axes, star
         area = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
         if area == 0.0:
             continue
-        for y in range(max(0, int(ceil(min(ay, by, cy)))), min(cells.shape[0] - 1, int(floor(max(ay, by, cy)))) + 1):
+        for y in range(max(0, ceil(min(ay, by, cy))), min(cells.shape[0] - 1, floor(max(ay, by, cy))) + 1):
             for x in range(
-                max(0, int(ceil(min(ax, bx, cx)))), min(cells.shape[1] - 1, int(floor(max(ax, bx, cx)))) + 1
+                max(0, ceil(min(ax, bx, cx))), min(cells.shape[1] - 1, floor(max(ax, bx, cx))) + 1
             ):
                 p = ((bx - x) * (cy - y) - (by - y) * (cx - x)) / area
                 q = ((cx - x) * (ay - y) - (cy - y) * (ax - x)) / area
@@ -150,8 +150,8 @@ def _fill(cells, cover, depth, places, points, facets, light, shadow, axes, star
                 if value > 0.0:
                     here = (p * places[i, 2] * points[i] + q * places[j, 2] * points[j] + r * places[k, 2] * points[k])
                     here = here / nearness
-                    s = int(round((axes[0] @ here - start[0]) / step))
-                    t = int(round((axes[1] @ here - start[1]) / step))
+                    s = round((axes[0] @ here - start[0]) / step)
+                    t = round((axes[1] @ here - start[1]) / step)
                     inside = 0 <= s < shadow.shape[0] and 0 <= t < shadow.shape[1]
                     if inside and shadow[s, t] > axes[2] @ here + bias:
                         value = 0.0

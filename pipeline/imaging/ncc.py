@@ -1,7 +1,7 @@
 """Masked normalised cross-correlation: whole maps by FFT, single shifts by direct sums, and the pyramid under both.
 
-An offset d means ``image(x) ~ scale * template(x - d) + level``. The template covers the image's rectangle widened by the
-largest offset, so that every shift sees the whole of it: only the image needs a mask (Padfield 2012 without the
+An offset d means ``image(x) ~ scale * template(x - d) + level``. The template covers the image's rectangle widened by
+the largest offset, so that every shift sees the whole of it: only the image needs a mask (Padfield 2012 without the
 template's mask).
 """
 

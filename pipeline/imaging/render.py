@@ -2,8 +2,8 @@
 
 Cells (whole pixels, or a fraction of one) hold the mean radiance of the surface under them; where a limb crosses a
 cell it is sampled more finely. A discrete Gaussian then stands for the optics and the mean over a pixel's cells for the
-detector. Derivatives with respect to a shift are taken by the Gaussian's derivative, not by differences of pixels, which
-would flatten a sharp limb by a third.
+detector. Derivatives with respect to a shift are taken by the Gaussian's derivative, not by differences of pixels,
+which would flatten a sharp limb by a third.
 """
 
 from dataclasses import dataclass

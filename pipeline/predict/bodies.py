@@ -65,7 +65,8 @@ class BodyFate:
     diameter_px, phase_deg
         Apparent size (geometric mean of the outline's axes) and phase angle.
     reason
-        Empty, ``behind_camera``, ``outside_field``, ``too_small``, ``unlit`` or ``around_camera``.
+        Empty, ``behind_camera``, ``outside_field``, ``too_small``, ``unlit``, ``around_camera`` or
+        ``fills_frame``.
     """
 
     name: str
@@ -235,7 +236,7 @@ class BodyScene:
 
     @property
     def pivot_vu(self) -> FloatArray:
-        """(2,) centroid of the predicted centres (seed 000), held inside the array: levers of giants would be absurd."""
+        """(2,) centroid of the predicted centres (seed 000), each held inside the array: a giant's lever is absurd."""
         return self.centroid(self.views)
 
     def centroid(self, views: tuple[BodyView, ...]) -> FloatArray:
@@ -419,7 +420,9 @@ def form_of(view: BodyView) -> FloatArray:
 def _solid(view: BodyView, bodies: tuple[Body, ...]) -> Solid:
     """Body for the renderer, with whatever of the State may shade it, in the field or not."""
     law, parameter = law_of(view.body.photometry, view.body.photometry_parameter, view.phase_rad)
-    shading = [_occluder(other, view) for other in bodies if other.name != view.body.name and _may_shade(other, view.body)]
+    shading = [
+        _occluder(other, view) for other in bodies if other.name != view.body.name and _may_shade(other, view.body)
+    ]
     occluders = np.array(shading).reshape(-1, 12)
     return Solid(view.centre_km, form_of(view), view.sun, law, parameter, 1.0, occluders)
 
@@ -477,10 +480,49 @@ def predict_bodies(state: State, sigma_px: float, options: BodyPredictionOptions
         fates.append(_fate(body, view, reason))
         if isinstance(view, BodyView) and not reason:
             views.append(view)
+    views, fates = _without_backgrounds(views, fates, state.camera_model, canvas)
     views.sort(key=lambda view: -float(np.linalg.norm(view.centre_km)))
     canvas = canvas.grown(_CANVAS_SKY_PX, _CANVAS_SKY_PX)
     rays = ray_grid(state.camera_model, canvas) if views else None
     return BodyScene(state, reach, sigma_px, tuple(views), tuple(fates), canvas, rays)
+
+
+def _without_backgrounds(
+    views: list[BodyView], fates: list[BodyFate], camera: CameraModel, canvas: Window
+) -> tuple[list[BodyView], list[BodyFate]]:
+    """Leave out a body that fills all of the canvas where others are before it: without a limb it tells no place."""
+    corners = _outline_of(canvas)
+    uv = corners[:, ::-1] - camera.principal_point_vu[::-1]
+    slopes = uv @ np.linalg.inv(camera.k_px_per_mm).T / camera.focal_length_mm
+    rays = np.column_stack([slopes, np.ones(len(slopes))])
+    filling = {
+        view.body.name
+        for view in views
+        if intersect(view.body.radii_km, view.observer_km, rays @ view.camera_from_body)[1].all()
+    }
+    if not filling or len(filling) == len(views):
+        return views, fates
+    kept = [view for view in views if view.body.name not in filling]
+    marked = [replace(f, reason="fills_frame") if f.name in filling and not f.reason else f for f in fates]
+    return kept, marked
+
+
+def _outline_of(window: Window) -> FloatArray:
+    """(n, 2) corners and middles of the sides of a window: a body behind all of them shows no limb inside.
+
+    Parameters
+    ----------
+    window
+        Pixels.
+
+    Returns
+    -------
+    numpy.ndarray
+        Rows and columns.
+    """
+    v = window.v0 + window.rows * np.array([0.0, 0.5, 1.0])
+    u = window.u0 + window.cols * np.array([0.0, 0.5, 1.0])
+    return np.stack(np.meshgrid(v, u, indexing="ij"), axis=2).reshape(-1, 2)
 
 
 def reach_px(state: State) -> tuple[int, int]:

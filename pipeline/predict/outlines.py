@@ -48,9 +48,7 @@ class Outline(Record):
 
     def __post_init__(self) -> None:
         n = len(self.vertices_vu)
-        self._freeze(
-            vertices_vu=(n, 2), normal_vu=(n, 2), direction=(n, 3), body=(n,), usable=(n,), reason=(n,)
-        )
+        self._freeze(vertices_vu=(n, 2), normal_vu=(n, 2), direction=(n, 3), body=(n,), usable=(n,), reason=(n,))
 
     def __len__(self) -> int:
         return len(self.vertices_vu)

@@ -86,11 +86,13 @@ def body_blob_nav(
         if moment is None:
             return TechniqueFailure(NAME, StatusReason.NO_FEATURES_DETECTED, "the blob has no light")
         before = offset
-        offset, _ = compose(context, cutout.offset_vu, 0.0, cutout.views[0].centre_vu, np.append(moment.shift, 0.0))
-        if float(np.hypot(*moment.shift)) > max(2.0, 0.25 * cutout.views[0].diameter_px):
+        offset, _ = compose(context, cutout.offset_vu, 0.0, cutout.primary.centre_vu, np.append(moment.shift, 0.0))
+        if float(np.hypot(*moment.shift)) > max(2.0, 0.25 * cutout.primary.diameter_px):
             return TechniqueFailure(NAME, StatusReason.NO_FEATURES_DETECTED, "the blob is not of the body's shape")
         if float(np.hypot(*(offset - before))) < _SETTLED_PX:
             break
+    assert cutout is not None
+    assert moment is not None
     if _likeness(cutout) < options.min_likeness * _expected_likeness(cutout, frame, moment):
         return TechniqueFailure(NAME, StatusReason.NO_FEATURES_DETECTED, "the blob does not look like the body")
     covariance = _covariance(cutout, frame, moment, options)
@@ -114,7 +116,7 @@ def _brightest(
     sky = float(np.median(light[~bad])) if (~bad).any() else 0.0
     excess = np.where(bad, np.float32(0.0), light - np.float32(sky))
     smooth = cv2.GaussianBlur(excess, (0, 0), 1.0)
-    noise = np.sqrt(frame.noise.variance(sky)) / (2.0 * np.sqrt(np.pi))
+    noise = np.sqrt(frame.noise.variance(np.array(sky))) / (2.0 * np.sqrt(np.pi))
     # Light of a night side, and the wings of a bright one, are no part of what the rendering shows.
     threshold = max(options.threshold_sigma * float(noise), options.threshold_share * float(smooth.max()))
     count, labels, stats, _ = cv2.connectedComponentsWithStats((smooth > threshold).astype(np.uint8))
@@ -197,14 +199,14 @@ def _moment(cutout: Cutout) -> _Moment | None:
     scale = float(data.sum() / expected.sum())
     if not scale > 0:
         return None
-    v, u = (index[support].astype(float) for index in np.indices(template.shape))
+    v, u = (index.astype(float) for index in np.nonzero(support))
     middle = np.array([expected @ v, expected @ u]) / expected.sum()
     arm = np.stack([v - middle[0], u - middle[1]], axis=1)
     # How the moment answers to a shift: one, but for the light that the support's border cuts off.
     slopes = np.stack([cutout.template.along_v[support], cutout.template.along_u[support]], axis=1).astype(float)
     answer = -(arm.T @ slopes)
     lever = arm @ np.linalg.inv(answer).T / scale
-    place = middle + [cutout.window.v0, cutout.window.u0]
+    place = middle + np.array([cutout.window.v0, cutout.window.u0], float)
     return _Moment(lever.T @ data, place, lever, support, scale, sky)
 
 
@@ -242,7 +244,7 @@ def _covariance(cutout: Cutout, frame: Frame, moment: _Moment, options: BodyBlob
     pull = lever.sum(axis=0)
     covariance += sky_variance * np.outer(pull, pull)
     errors = assumed_errors(cutout.primary, options.errors)
-    v, u = (index[support].astype(float) for index in np.indices(support.shape))
+    v, u = (index.astype(float) for index in np.nonzero(support))
     slope = moment.scale * np.hypot(template.along_v, template.along_u)[support].astype(float)
     covariance += correlated_sums(lever, errors.texture * light, (v, u), errors.texture_px)
     covariance += correlated_sums(lever, errors.wide_texture * light, (v, u), errors.wide_texture_px)

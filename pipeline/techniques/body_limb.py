@@ -282,45 +282,63 @@ def _fit_line(
 ) -> _LineFit | str:
     """Measure, fit, predict again, until the template's own grid is reached."""
     offset, rotation = start.offset_vu, start.rotation_rad
-    fixed_turn = not context.fit_camera_rotation
     for _ in range(_ROUNDS):
         cutout = cut_out(scene, frame, offset, rotation)
         if cutout is None or not cutout.good.any():
             return "the body is outside the frame"
-        camera = context.camera_model
-        if at_limb:
-            outline = limb_outline(cutout.views, camera, cutout.template)
-        else:
-            clear = band.half_width_px + 3.0 * cutout.sigma_px
-            outline = terminator_outline(cutout.views, camera, cutout.template, clear)
-        levels = _levels(cutout, fix)
-        if not levels.scale > 0:
-            return "the image is not bright where the body is"
-        errors = fix.errors if fix is not None else assumed_errors(cutout.primary, error_options)
-        segments = measure_segments(cutout, outline, frame, levels, errors, band)
+        segments = _segments(cutout, frame, fix, context, band, error_options, at_limb)
         if isinstance(segments, str):
             return segments
-        good = segments.take(segments.ok)
-        weight = 1.0 / good.sigma_px**2
-        pivot = weight @ good.place_vu / weight.sum()
-        lever = None if fixed_turn else turn_lever(good.place_vu, pivot)
-        relief = fit_relief(good, lever, fields, relief_options)
-        if not fixed_turn and not rotation_shows(relief.information, context):
-            # The line does not show the rotation: what the others can tell is fitted without it.
-            flat = fit_relief(good, None, fields, relief_options)
-            step = np.append(flat.step, 0.0)
-        else:
-            step = np.append(relief.step, 0.0)[:3] if fixed_turn else relief.step
+        pivot, relief, step = _step(segments, context, fields, relief_options)
         before = offset
         offset, rotation = compose(context, cutout.offset_vu, cutout.rotation_rad, pivot, step)
+        fit = _LineFit(offset, rotation, pivot, segments, relief, cutout.views)
         if float(np.hypot(*(offset - start.offset_vu))) > 3.0 * _RIVAL_PX + band.largest_shift_px:
             return "the fit runs away from where the line was found"
         again = scene.quantised(offset, rotation)
-        if (again[0] == cutout.offset_vu).all() and again[1] == cutout.rotation_rad:
+        settled = (again[0] == cutout.offset_vu).all() and again[1] == cutout.rotation_rad
+        if settled or float(np.hypot(*(offset - before))) < _SETTLED_PX:
             break
-        if float(np.hypot(*(offset - before))) < _SETTLED_PX:
-            break
-    return _LineFit(offset, rotation, pivot, segments, relief, cutout.views)
+    return fit
+
+
+def _segments(
+    cutout: Cutout,
+    frame: Frame,
+    fix: TemplateFit | None,
+    context: NavContext,
+    band: BandOptions,
+    error_options: ModelErrorOptions,
+    at_limb: bool,
+) -> Segments | str:
+    """Pieces of the limb or the terminator, measured on a template."""
+    camera = context.camera_model
+    if at_limb:
+        outline = limb_outline(cutout.views, camera, cutout.template)
+    else:
+        clear = band.half_width_px + 3.0 * cutout.sigma_px
+        outline = terminator_outline(cutout.views, camera, cutout.template, clear)
+    levels = _levels(cutout, fix)
+    if not levels.scale > 0:
+        return "the image is not bright where the body is"
+    errors = fix.errors if fix is not None else assumed_errors(cutout.primary, error_options)
+    return measure_segments(cutout, outline, frame, levels, errors, band)
+
+
+def _step(
+    segments: Segments, context: NavContext, fields: dict[int, Field_], options: ReliefOptions
+) -> tuple[FloatArray, ReliefFit, FloatArray]:
+    """Pivot, fit and (3,) step from measured pieces; a rotation that the line does not show stays."""
+    good = segments.take(segments.ok)
+    weight = 1.0 / good.sigma_px**2
+    pivot = weight @ good.place_vu / weight.sum()
+    if not context.fit_camera_rotation:
+        relief = fit_relief(good, None, fields, options)
+        return pivot, relief, np.append(relief.step, 0.0)
+    relief = fit_relief(good, turn_lever(good.place_vu, pivot), fields, options)
+    if rotation_shows(relief.information, context):
+        return pivot, relief, relief.step
+    return pivot, relief, np.append(fit_relief(good, None, fields, options).step, 0.0)
 
 
 def _levels(cutout: Cutout, fix: TemplateFit | None) -> Levels:

@@ -1,4 +1,4 @@
-"""Small bodies beside a large one: they show the rotation that a round disc cannot, once they are found on their arcs."""
+"""Small bodies beside a large one show the rotation that a round disc cannot, once they are found on their arcs."""
 
 import numpy as np
 

@@ -86,8 +86,11 @@ class Segments(Record):
 
     def take(self, index: NDArray[np.generic]) -> "Segments":
         """Rows of an index or mask."""
-        arrays = (getattr(self, name)[index] for name in list(Segments.__dataclass_fields__)[:-2])
-        return Segments(*arrays, self.texture_px, self.texture_reach_px)
+        return Segments(
+            self.place_vu[index], self.normal_vu[index], self.direction[index], self.body[index],
+            self.shift_px[index], self.sigma_px[index], self.strength[index], self.ok[index],
+            self.texture_px, self.texture_reach_px,
+        )  # fmt: skip
 
 
 def measure_segments(
@@ -162,8 +165,8 @@ def _albedo_shift(errors: ModelErrors, cutout: Cutout) -> float:
     """1 sigma of the shift of a blurred edge by albedo that varies along the normal.
 
     An edge of width w (a Gaussian integral) under a relative brightness g moves by int(g T T') / int(T'^2): for g alike
-    over a length L < w that is tau sqrt(1.26 L w), for one alike over more it is the gradient's tau w^2 / L. Near a limb
-    the surface is foreshortened: what is alike over l on it is so over l^2 / D across the limb.
+    over a length L < w that is tau sqrt(1.26 L w), for one alike over more it is the gradient's tau w^2 / L. Near a
+    limb the surface is foreshortened: what is alike over l on it is so over l^2 / D across the limb.
     """
     width = float(np.sqrt(cutout.sigma_px**2 + _PIXEL_VARIANCE))
     diameter = cutout.primary.diameter_px
@@ -221,7 +224,7 @@ def _middles(
 
     def mean(values: FloatArray) -> FloatArray:
         sums = [np.bincount(piece, values[usable, k], count) for k in range(values.shape[1])]
-        return np.stack(sums, axis=1) / number
+        return np.asarray(np.stack(sums, axis=1) / number)
 
     normal, direction = mean(outline.normal_vu), mean(outline.direction)
     normal /= np.linalg.norm(normal, axis=1)[:, None]
@@ -249,7 +252,7 @@ def _local_fits(
             gram[:, i, j] = gram[:, j, i] = np.bincount(group, weight * columns[i] * columns[j], count)
     gram += np.diag(priors)
     gram[:, 0, 0] += 1e-9 + 1e-12 * gram[:, 1, 1]
-    covariance = np.linalg.inv(gram)
+    covariance = np.asarray(np.linalg.inv(gram), float)
     values = np.einsum("mij,mj->mi", covariance, pull)
     left = residual - sum(columns[k] * values[group, k] for k in range(3))
     pixels = np.bincount(group, minlength=count).astype(float)

@@ -159,13 +159,13 @@ def lm_subpixel_refine(
         gradient = jacobian.T @ (weight * residual)
         scaled = np.array([1.0, 1.0, arm])[:size]
         matrix = information + damping * np.diag(np.maximum(np.diag(information), 1e-9 * scaled**2))
-        step = np.zeros(3)
-        step[:size] = -np.linalg.solve(matrix + 1e-12 * np.diag(scaled**2), gradient)
-        if np.hypot(*step[:2]) + arm * abs(step[2]) < _SETTLED_PX:
+        change = np.zeros(3)
+        change[:size] = -np.linalg.solve(matrix + 1e-12 * np.diag(scaled**2), gradient)
+        if np.hypot(*change[:2]) + arm * abs(change[2]) < _SETTLED_PX:
             break
-        trial = cost(state + step, scale)
+        trial = cost(state + change, scale)
         if trial[0] < value:
-            state, (value, residual, weight), damping = state + step, trial, damping / 5.0
+            state, (value, residual, weight), damping = state + change, trial, damping / 5.0
             used = weight > 0
             fresh = 1.4826 * float(np.median(residual[used])) if used.any() else scale
             scale = max(_LEAST_SCATTER_PX, min(scale, fresh))

@@ -1,9 +1,9 @@
 """By how much a rendered body differs from a real one, and what that does to a fit.
 
-Three things separate a perfect rendering from an image: the noise of a pixel; albedo that no catalogue knows (a share
-``texture`` of the light, alike over ``texture_px``); and a surface off its shape (``relief_px`` along the gradient, alike
-over ``relief_reach_px``). All three weigh the pixels; the last two are correlated, and their covariance is carried
-through the fit: ``cov = G^-1 M G^-1`` with M the covariance of the weighted sums (White 1980 for the form).
+Three things separate a perfect rendering from an image: the noise of a pixel; albedo and slopes that no catalogue knows
+(a share ``texture`` of the light, alike over ``texture_px``); and a surface off its shape (``relief_px`` along the
+gradient, alike over ``relief_reach_px``). All weigh the pixels; the last two are correlated, and their covariance is
+carried through the fit: ``cov = G^-1 M G^-1`` with M the covariance of the weighted sums (White 1980 for the form).
 """
 
 from dataclasses import dataclass, replace
@@ -21,6 +21,8 @@ _BLOCKS_PER_REACH = 4.0
 # Median of the square of a standard normal variable.
 _MEDIAN_SQUARE = 0.455
 _FEWEST_PIXELS = 30
+_PATCH_SIDES = (8, 32, 128)
+_FEWEST_BLOCKS = 8
 
 
 class ModelErrorOptions(Options):
@@ -44,6 +46,8 @@ class ModelErrors:
         Relative rms and reach.
     wide_texture, wide_texture_px
         The same of provinces as large as hemispheres, which no single image can tell from the body's shading.
+    patches
+        (rms, reach in pixels) of albedo that is left in means over ever larger blocks of the face.
     shading
         1 sigma of the brightness that slopes of the surface change, relative to the template's unit; it does not fade
         toward the terminator as albedo does.
@@ -55,6 +59,7 @@ class ModelErrors:
     texture_px: float
     wide_texture: float
     wide_texture_px: float
+    patches: tuple[tuple[float, float], ...]
     shading: float
     relief_px: float
     relief_reach_px: float
@@ -80,7 +85,8 @@ def assumed_errors(view: BodyView, options: ModelErrorOptions) -> ModelErrors:
     relief = options.relief_share * radius if sigma_km is None else sigma_km * view.px_per_km
     reach = float(np.radians(view.body.shape_correlation_deg)) * radius
     narrow, wide = (max(share * radius, 1.0) for share in (options.texture_reach, options.wide_reach))
-    return ModelErrors(options.texture, narrow, options.wide_share * options.texture, wide, 0.0, relief, max(reach, 1.0))
+    wide_rms = options.wide_share * options.texture
+    return ModelErrors(options.texture, narrow, wide_rms, wide, (), 0.0, relief, max(reach, 1.0))
 
 
 def measured_errors(
@@ -119,19 +125,21 @@ def measured_errors(
     """
     steepest, brightest = float(slope.max()), float(light.max())
     face = good & (light > 0.25 * brightest) & (slope < 0.25 * steepest)
-    rms, reach, patches = options.texture, assumed.texture_px, 0.0
+    rms, reach, count = options.texture, assumed.texture_px, 0.0
+    patches: tuple[tuple[float, float], ...] = ()
     if np.count_nonzero(face) > _FEWEST_PIXELS:
         rms = float(np.sqrt(max(excess[face].sum() / (light[face] ** 2).sum(), 0.0)))
         ratio = np.where(face, residual / np.where(face, light, 1.0), 0.0)
         reach = _reach(ratio, face, rms, assumed.texture_px)
-        patches = np.count_nonzero(face) / max(2.0 * np.pi * reach**2, 1.0)
+        count = np.count_nonzero(face) / max(2.0 * np.pi * reach**2, 1.0)
+        patches = _patches(ratio, face, rms, reach)
     dof = options.texture_dof
-    texture = float(np.sqrt((dof * options.texture**2 + patches * rms**2) / max(dof + patches, 1e-9)))
+    texture = float(np.sqrt((dof * options.texture**2 + count * rms**2) / max(dof + count, 1e-9)))
     dusk = good & (light > 0.005 * brightest) & (light < 0.25 * brightest) & (slope < 0.25 * steepest)
     shading = 0.0
     if np.count_nonzero(dusk) > _FEWEST_PIXELS:
-        left = float((excess[dusk] - (texture * light[dusk]) ** 2).mean())
-        shading = float(np.sqrt(max(left, 0.0))) / scale_dn
+        dim = float((excess[dusk] - (texture * light[dusk]) ** 2).mean())
+        shading = float(np.sqrt(max(dim, 0.0))) / scale_dn
     edge = good & (slope > 0.5 * steepest)
     relief2 = 0.0
     if np.count_nonzero(edge) > _FEWEST_PIXELS:
@@ -139,7 +147,33 @@ def measured_errors(
         relief2 = float(np.median(left) / _MEDIAN_SQUARE / np.median(slope[edge] ** 2))
     relief = max(assumed.relief_px, float(np.sqrt(max(relief2, 0.0))))
     wide = options.wide_share * texture
-    return replace(assumed, texture=texture, texture_px=reach, wide_texture=wide, shading=shading, relief_px=relief)
+    return replace(
+        assumed, texture=texture, texture_px=reach, wide_texture=wide, patches=patches, shading=shading,
+        relief_px=relief,
+    )  # fmt: skip
+
+
+def _patches(ratio: FloatArray, face: BoolArray, rms: float, reach: float) -> tuple[tuple[float, float], ...]:
+    """Albedo of each size of block beyond what smaller sizes leave in a mean over it."""
+    found: list[tuple[float, float]] = []
+    expected = [(rms, reach)]
+    filled = np.where(face, ratio, 0.0).astype(np.float32)
+    for side in _PATCH_SIDES:
+        rows, cols = face.shape[0] // side, face.shape[1] // side
+        if min(rows, cols) < 2 or side < 3.0 * reach:
+            continue
+        inner = np.s_[: rows * side, : cols * side]
+        whole = cv2.resize(face[inner].astype(np.float32), (cols, rows), interpolation=cv2.INTER_AREA) > 0.9
+        if np.count_nonzero(whole) < _FEWEST_BLOCKS:
+            continue
+        means = cv2.resize(filled[inner], (cols, rows), interpolation=cv2.INTER_AREA)[whole]
+        # A covariance rms^2 exp(-r/reach) integrates to 2 pi reach^2 rms^2, which a large block's mean shares out.
+        known = sum(a**2 * min(1.0, 2.0 * np.pi * r**2 / side**2) for a, r in expected)
+        left = float(means.var()) - known
+        if left > 0:
+            found.append((float(np.sqrt(left)), float(side)))
+            expected.append(found[-1])
+    return tuple(found)
 
 
 def _reach(ratio: FloatArray, inside: BoolArray, rms: float, default: float) -> float:

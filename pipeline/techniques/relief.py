@@ -92,9 +92,7 @@ class ReliefFit(Record):
 
     def __post_init__(self) -> None:
         size = len(self.step)
-        self._freeze(
-            step=(size,), information=(size, size), residual_px=(None,), weight=(None,), common_px=(None,)
-        )
+        self._freeze(step=(size,), information=(size, size), residual_px=(None,), weight=(None,), common_px=(None,))
 
 
 def fit_relief(
@@ -139,9 +137,7 @@ def fit_relief(
         if any(common[b] < 1e3 for b in free):
             common |= dict.fromkeys(free, 1e3)
             continue
-        lifted = residual - sum(
-            np.where(segments.body == b, h, 0.0) for b, h in zip(bodies, heights, strict=True)
-        )
+        lifted = residual - sum(np.where(segments.body == b, h, 0.0) for b, h in zip(bodies, heights, strict=True))
         spread = np.sqrt(segments.sigma_px**2 + short**2 * np.diag(near) + long_**2 * np.diag(far))
         weight = tukey_weight(lifted / spread, 1.0)
     rms = float(np.sqrt(np.mean(np.diag(near)))) * short
@@ -209,6 +205,7 @@ def _likeliest(
     prior = -2.5 * np.log1p((np.log(_FACTORS) / width) ** 2 / 4.0)
     absent, present = np.log(1.0 - options.wrong_shape_chance), np.log(options.wrong_shape_chance)
     long_prior = np.where(_LONG_FACTORS > 0, present - np.log(len(_LONG_FACTORS) - 1), absent)
+
     def score(f: float, g: float) -> float:
         return _restricted_likelihood(shift, design, base + f**2 * near + g**2 * far)
 
@@ -221,7 +218,11 @@ def _likeliest(
     if plain[1] <= _ODD_FACTOR and start[1] == 0.0:
         return plain[1], 0.0
     # Reliefs far beyond what was expected: short waves and a wrong shape are weighed against each other.
-    scored = [(float(p) + s, f, float(g)) for g, p in zip(_LONG_FACTORS, long_prior, strict=True) for s, f in [best_short(float(g))]]
+    scored = [
+        (float(p) + s, f, float(g))
+        for g, p in zip(_LONG_FACTORS, long_prior, strict=True)
+        for s, f in [best_short(float(g))]
+    ]
     _, short, long_ = max(scored)
     return short, long_
 

@@ -33,6 +33,7 @@ from pipeline.techniques.model_errors import (
 )
 
 _ROUNDS = 8
+_FEWEST_PIXELS = 16
 _LARGEST_STEP_PX = 2.0
 _SETTLED_PX = 0.01
 # From this size on, smooth parts are averaged over blocks before the fit.
@@ -108,8 +109,8 @@ class TemplateFit:
 class _Samples:
     """Pixels, and means of blocks of smooth ones.
 
-    ``planes`` is (n, 7): data, image, along v, along u, night, widening, spin; ``row`` and ``col`` count from the window.
-    ``light`` and ``slope`` are the template's largest value and gradient nearby.
+    ``planes`` is (n, 7): data, image, along v, along u, night, widening, spin; ``row`` and ``col`` count from the
+    window; ``light`` and ``slope`` are the template's largest value and gradient nearby.
     """
 
     planes: FloatArray
@@ -164,38 +165,64 @@ def fit_template(
     TemplateFit or str
         Or why there is none.
     """
-    offset, rotation = np.asarray(start_vu, float), start_rad
-    levels: Levels | None = None
-    errors: ModelErrors | None = None
+    state = _State(np.asarray(start_vu, float), start_rad, None, None)
     for _ in range(_ROUNDS):
-        cutout = cut_out(scene, frame, offset, rotation)
-        if cutout is None or np.count_nonzero(cutout.good) < 16:
+        cutout = cut_out(scene, frame, state.offset_vu, state.rotation_rad)
+        if cutout is None or np.count_nonzero(cutout.good) < _FEWEST_PIXELS:
             return "too few pixels"
-        pivot = cutout.pivot_vu
-        levels = levels or rough_levels(cutout)
-        errors = errors or assumed_errors(cutout.primary, options)
-        if not levels.scale > 0:
-            return "the image is not bright where the template is"
-        samples = _sample(cutout)
-        solution = _solve(samples, cutout, frame.noise, levels, errors, pivot, context)
-        k = solution.size
-        levels = Levels(
-            levels.scale + solution.values[k], levels.sky + solution.values[k + 3], levels.night + solution.values[k + 1]
-        )
-        if not np.isfinite(solution.values).all() or not levels.scale > 0:
-            return "the fit has no solution"
-        errors = _look(cutout, frame.noise, levels, solution, options)
-        step = np.zeros(3)
-        step[:k] = solution.values[:k]
-        length = float(np.hypot(*step[:2]))
-        step *= min(1.0, _LARGEST_STEP_PX / max(length, 1e-12))
-        last = offset
-        offset, rotation = compose(context, cutout.offset_vu, cutout.rotation_rad, pivot, step)
-        again = scene.quantised(offset, rotation)
+        last, outcome = state.offset_vu, _round(cutout, frame.noise, state, context, options)
+        if isinstance(outcome, str):
+            return outcome
+        fitted, state = outcome, outcome.state
+        again = scene.quantised(state.offset_vu, state.rotation_rad)
         same = bool((again[0] == cutout.offset_vu).all()) and again[1] == cutout.rotation_rad
-        if same or float(np.hypot(*(offset - last))) < _SETTLED_PX:
+        if same or float(np.hypot(*(state.offset_vu - last))) < _SETTLED_PX:
             break
-    return _answer(offset, rotation, pivot, samples, solution, cutout, frame.noise, levels, errors, context)
+    return _answer(fitted, frame.noise, context)
+
+
+@dataclass(frozen=True, eq=False)
+class _State:
+    """Pointing at the array centre, brightnesses and errors so far."""
+
+    offset_vu: FloatArray
+    rotation_rad: float
+    levels: Levels | None
+    errors: ModelErrors | None
+
+
+@dataclass(frozen=True, eq=False)
+class _Round:
+    """One round: what was fitted on which template, and where it led."""
+
+    state: _State
+    levels: Levels
+    errors: ModelErrors
+    cutout: Cutout
+    samples: _Samples
+    solution: _Solution
+
+
+def _round(
+    cutout: Cutout, noise: PixelNoise, state: _State, context: NavContext, options: ModelErrorOptions
+) -> _Round | str:
+    """Solve on one template, renew the errors, and step."""
+    levels = state.levels or rough_levels(cutout)
+    errors = state.errors or assumed_errors(cutout.primary, options)
+    if not levels.scale > 0:
+        return "the image is not bright where the template is"
+    samples = _sample(cutout)
+    solution = _solve(samples, cutout, noise, levels, errors, context)
+    k, values = solution.size, solution.values
+    levels = Levels(levels.scale + values[k], levels.sky + values[k + 3], levels.night + values[k + 1])
+    if not np.isfinite(values).all() or not levels.scale > 0:
+        return "the fit has no solution"
+    errors = _look(cutout, noise, levels, solution, options)
+    step = np.zeros(3)
+    step[:k] = values[:k]
+    step *= min(1.0, _LARGEST_STEP_PX / max(float(np.hypot(*step[:2])), 1e-12))
+    offset, rotation = compose(context, cutout.offset_vu, cutout.rotation_rad, cutout.pivot_vu, step)
+    return _Round(_State(offset, rotation, levels, errors), levels, errors, cutout, samples, solution)
 
 
 def _slope_length(cutout: Cutout) -> FloatArray:
@@ -215,7 +242,7 @@ def _sample(cutout: Cutout) -> _Samples:
     planes = (cutout.data, t.image, t.along_v, t.along_u, t.night, t.widening, spin, *held)
     rows, cols = cutout.good.shape
     single = cutout.good
-    blocks: list[FloatArray] = []
+    blocks = np.zeros((len(planes) + 3, 0))
     if cutout.good.size > _MANY_PIXELS:
         rough = (slope > _STEEP * float(slope.max())) | ~cutout.good
         tall, wide = rows // _BLOCK, cols // _BLOCK
@@ -228,12 +255,11 @@ def _sample(cutout: Cutout) -> _Samples:
         means = [cv2.resize(p[inner], (wide, tall), interpolation=cv2.INTER_AREA)[smooth] for p in planes]
         i, j = np.nonzero(smooth)
         middle = (_BLOCK - 1) / 2
-        blocks = [*means, i * float(_BLOCK) + middle, j * float(_BLOCK) + middle, np.full(len(i), float(_BLOCK**2))]
+        rows_of, cols_of = i * float(_BLOCK) + middle, j * float(_BLOCK) + middle
+        blocks = np.array([*means, rows_of, cols_of, np.full(len(i), float(_BLOCK**2))], float)
     i, j = np.nonzero(single)
     pixels = [*(p[single] for p in planes), i.astype(float), j.astype(float), np.ones(len(i))]
-    table = np.array(pixels, float)
-    if blocks:
-        table = np.concatenate([table, np.array(blocks, float)], axis=1)
+    table = np.concatenate([np.array(pixels, float), blocks], axis=1)
     return _Samples(np.ascontiguousarray(table[:7].T), *table[7:])
 
 
@@ -281,12 +307,11 @@ def _solve(
     noise: PixelNoise,
     levels: Levels,
     errors: ModelErrors,
-    pivot: FloatArray,
     context: NavContext,
 ) -> _Solution:
     turns = context.fit_camera_rotation
     size = 3 if turns else 2
-    design = _design(samples, cutout, pivot, levels.scale, turns)
+    design = _design(samples, cutout, cutout.pivot_vu, levels.scale, turns)
     weight = 1.0 / _variance(samples, noise, levels, errors)
     data, image, night = samples.planes[:, 0], samples.planes[:, 1], samples.planes[:, 4]
     target = data - levels.sky - levels.scale * image - levels.night * night
@@ -309,7 +334,7 @@ def _solve(
             prior[2] = 1e6 * gram[2, 2] + 1e-12
     gram = gram + np.diag(prior + 1e-12 * np.diag(gram))
     values = np.linalg.solve(gram, pull)
-    return _Solution(values, gram, prior, design, weight, target - design @ values, size, lever)
+    return _Solution(np.asarray(values), gram, prior, design, weight, target - design @ values, size, lever)
 
 
 def _marginal(information: FloatArray, size: int) -> FloatArray:
@@ -326,7 +351,7 @@ def _look(
 ) -> ModelErrors:
     """Errors of the rendering, from the residuals of all pixels of the cutout after the step."""
     t, k = cutout.template, solution.size
-    light = levels.scale * t.image
+    light = levels.scale * t.image.astype(float)
     model = levels.sky + light + levels.night * t.night
     moved = solution.values[0] * t.along_v + solution.values[1] * t.along_u
     model = model - levels.scale * moved + levels.scale * solution.values[k + 2] * t.widening
@@ -356,24 +381,17 @@ def _covariance(
     places = (samples.row, samples.col)
     total += correlated_sums(influence, errors.texture * light, places, errors.texture_px)
     total += correlated_sums(influence, _LEFT_OVER * errors.wide_texture * light, places, errors.wide_texture_px)
+    for rms, reach in errors.patches:
+        total += correlated_sums(influence, rms * light, places, reach)
     lit = np.where(samples.planes[:, 1] > 0, errors.shading * levels.scale, 0.0)
     total += correlated_sums(influence, lit, places, errors.texture_px)
     total += correlated_sums(influence, errors.relief_px * slope, places, errors.relief_reach_px)
     return np.asarray(total)
 
 
-def _answer(
-    offset: FloatArray,
-    rotation: float,
-    pivot: FloatArray,
-    samples: _Samples,
-    solution: _Solution,
-    cutout: Cutout,
-    noise: PixelNoise,
-    levels: Levels,
-    errors: ModelErrors,
-    context: NavContext,
-) -> TemplateFit | str:
+def _answer(fitted: _Round, noise: PixelNoise, context: NavContext) -> TemplateFit | str:
+    """Information, point spread and figures of the last round."""
+    samples, solution, levels, errors = fitted.samples, fitted.solution, fitted.levels, fitted.errors
     size = solution.size
     full = _covariance(samples, solution, noise, levels, errors)
     seen = size == 2 or solution.lever is None
@@ -389,17 +407,18 @@ def _answer(
     weight, model = solution.weight, levels.scale * samples.planes[:, 1]
     chi2 = float((weight * solution.residual**2).mean())
     # A rendering that fits worse than all that was granted to it is as much less certain (Birge 1932).
-    settled = settle(information / max(chi2, 1.0), pivot, context)
+    settled = settle(information / max(chi2, 1.0), fitted.cutout.pivot_vu, context)
     data = model + solution.residual
     dm, dd = model - np.average(model, weights=weight), data - np.average(data, weights=weight)
     power = float(np.sqrt((weight * dm**2).sum() * (weight * dd**2).sum()))
     signal = float((weight * dm**2).sum())
     grain = float((weight * noise.variance(levels.sky + model) / samples.pixels).sum())
     return TemplateFit(
-        offset_vu=offset, rotation_rad=rotation, pivot_vu=settled.pivot_vu, information=settled.information, scale_dn=levels.scale,
-        level_dn=levels.sky, night_dn=levels.night, variance_px2=float(solution.values[size + 2]),
+        offset_vu=fitted.state.offset_vu, rotation_rad=fitted.state.rotation_rad, pivot_vu=settled.pivot_vu,
+        information=settled.information, scale_dn=levels.scale, level_dn=levels.sky, night_dn=levels.night,
+        variance_px2=float(solution.values[size + 2]),
         variance_sigma_px2=float(np.sqrt(max(full[size, size], 0.0))),
         correlation=float((weight * dm * dd).sum()) / power if power > 0 else 0.0,
-        expected_correlation=float(np.sqrt(signal / max(signal + grain, 1e-30))),
-        chi2_per_sample=chi2, errors=errors, cutout=cutout,
+        expected_correlation=float(np.sqrt(signal / max(signal + grain, 1e-30))), chi2_per_sample=chi2, errors=errors,
+        cutout=fitted.cutout,
     )  # fmt: skip
