@@ -18,7 +18,10 @@ demo: install
 	$(BIN)/pilotage sample stars $(DEMO)/stars
 	$(BIN)/pilotage run $(DEMO)/stars --output $(DEMO)/run || test $$? -eq 1
 	$(BIN)/pilotage show $(DEMO)/run --truth $(DEMO)/stars/truth.json --limit 20
-	@echo "The archive is in $(DEMO)/stars, the answers in $(DEMO)/run: offsets/ and the other tables, images/*.json."
+	$(BIN)/pilotage sample flyby $(DEMO)/flyby
+	$(BIN)/pilotage run $(DEMO)/flyby --output $(DEMO)/flyby-run || test $$? -eq 1
+	$(BIN)/pilotage show $(DEMO)/flyby-run --truth $(DEMO)/flyby/truth.json --limit 24
+	@echo "The archives are in $(DEMO)/stars and $(DEMO)/flyby, the answers in $(DEMO)/run and $(DEMO)/flyby-run: offsets/ and the other tables, images/*.json."
 
 test: install
 	$(BIN)/python -m pytest -n 2

@@ -1,4 +1,4 @@
-"""Summary picture of one navigated star field."""
+"""Summary picture of one navigated image."""
 
 from collections.abc import Mapping
 from io import BytesIO
@@ -59,11 +59,15 @@ def _mark_features(axes: object, features: Mapping[str, Json]) -> None:
     refused = ~used & np.isfinite(columns["measured_v_px"])
     plot = axes.plot  # type: ignore[attr-defined]
     style = {"linestyle": "none", "markerfacecolor": "none"}
-    plot(columns["predicted_u_px"], columns["predicted_v_px"], marker="+", ms=6, mew=0.8, color=_PREDICTED,
+    # A line has many pieces close together: large marks would hide it.
+    pieces = bool(set(map(str, features["kind"])) & {"limb", "terminator"})  # type: ignore[arg-type]
+    cross, mark = (3, 3) if pieces else (6, 10)
+    plot(columns["predicted_u_px"], columns["predicted_v_px"], marker="+", ms=cross, mew=0.8, color=_PREDICTED,
          label="predicted", **style)  # fmt: skip
     for mask, marker, colour, label in ((used, "s", _USED, "used"), (refused, "o", _REJECTED, "refused")):
         u, v = columns["measured_u_px"][mask], columns["measured_v_px"][mask]
-        plot(u, v, marker=marker, ms=10, mew=1.2, color=colour, label=f"{label} ({int(mask.sum())})", **style)
+        width = 0.6 if pieces else 1.2
+        plot(u, v, marker=marker, ms=mark, mew=width, color=colour, label=f"{label} ({int(mask.sum())})", **style)
     joins_u = np.stack([columns["predicted_u_px"][used], columns["measured_u_px"][used]])
     joins_v = np.stack([columns["predicted_v_px"][used], columns["measured_v_px"][used]])
     plot(joins_u, joins_v, color=_USED, lw=0.5)
@@ -74,7 +78,10 @@ def _features(document: Mapping[str, Json]) -> Mapping[str, Json]:
     """Inventory of the technique that was fused, else of any that has one."""
     answers = document["techniques"]
     listed = [t for t in answers if isinstance(t, dict) and t.get("features")] if isinstance(answers, list) else []
-    listed.sort(key=lambda t: not t.get("in_ensemble"))
+    # Of a disc or a blob the inventory is one row: the pieces of its limb show more.
+    bodies = any(t.get("in_ensemble") and str(t["technique"]).startswith("Body") for t in listed)
+    lines = {"BodyLimbNav"} if bodies else set()
+    listed.sort(key=lambda t: (t["technique"] not in lines, not t.get("in_ensemble")))
     features = listed[0]["features"] if listed else None
     return features if isinstance(features, dict) else {}
 

@@ -366,6 +366,8 @@ class Template:
         Derivative of ``image`` with respect to v and u, per pixel.
     night
         Share of a pixel that unlit surface covers: its light (planetshine) is no part of ``image``.
+    cover
+        Share of a pixel that any surface covers, lit or not.
     widening
         Derivative of ``image`` with respect to the variance of the point spread, per px^2.
     spin
@@ -378,6 +380,7 @@ class Template:
     along_v: Image
     along_u: Image
     night: Image
+    cover: Image
     widening: Image
     spin: Image | None = None
 
@@ -430,7 +433,8 @@ def blur(cells: Cells, window: Window, sigma_px: float) -> Template:
     # The blurred image obeys the heat equation: dT/d(variance) is half its Laplacian.
     laplacian = _filtered(cells.light, bend, smooth, window, over) + _filtered(cells.light, smooth, bend, window, over)
     night = _filtered(np.where(cells.light > 0.0, np.float32(0.0), cells.cover), smooth, smooth, window, over)
-    return Template(window, image, along_v, along_u, night, laplacian * np.float32(0.5 * over**2))
+    cover = _filtered(cells.cover, smooth, smooth, window, over)
+    return Template(window, image, along_v, along_u, night, cover, laplacian * np.float32(0.5 * over**2))
 
 
 def blur_image(cells: Cells, window: Window, sigma_px: float) -> Image:

@@ -200,9 +200,9 @@ def _mesh_outline(view: BodyView, index: int, template: Template | None, at_limb
     rows, cols = lit.shape
     beside = np.rint(places + _BESIDE_PX * normal).astype(int)
     inside = (length > 0) & (beside >= 0).all(axis=1) & (beside[:, 0] < rows) & (beside[:, 1] < cols)
-    night = np.zeros(len(places))
-    night[inside] = template.night[beside[inside, 0], beside[inside, 1]]
-    wanted = inside & ((night < 0.5) if at_limb else (night >= 0.5))
+    behind = np.zeros(len(places))
+    behind[inside] = template.cover[beside[inside, 0], beside[inside, 1]]
+    wanted = inside & ((behind < 0.5) if at_limb else (behind >= 0.5))
     seen = places[wanted] + [template.window.v0, template.window.u0]
     across = (seen - view.centre_vu) / max(view.diameter_px / 2, 1.0)
     direction = np.concatenate([across, np.full((len(seen), 1), 0.3)], axis=1)

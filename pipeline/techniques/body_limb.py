@@ -89,7 +89,7 @@ class _Start:
 
 @dataclass(frozen=True, eq=False)
 class _LineFit:
-    """Settled fit of an outline."""
+    """Settled fit of an outline; ``misfit`` is the chi-square per sample of the rendering as a whole."""
 
     offset_vu: FloatArray
     rotation_rad: float
@@ -97,6 +97,7 @@ class _LineFit:
     segments: Segments
     relief: ReliefFit
     views: tuple[BodyView, ...]
+    misfit: float
 
 
 def body_limb_nav(
@@ -292,7 +293,8 @@ def _fit_line(
         pivot, relief, step = _step(segments, context, fields, relief_options)
         before = offset
         offset, rotation = compose(context, cutout.offset_vu, cutout.rotation_rad, pivot, step)
-        fit = _LineFit(offset, rotation, pivot, segments, relief, cutout.views)
+        misfit = fix.chi2_per_sample if fix is not None else 1.0
+        fit = _LineFit(offset, rotation, pivot, segments, relief, cutout.views, misfit)
         if float(np.hypot(*(offset - start.offset_vu))) > 3.0 * _RIVAL_PX + band.largest_shift_px:
             return "the fit runs away from where the line was found"
         again = scene.quantised(offset, rotation)
@@ -364,8 +366,9 @@ def _result(
     if share < min_shown_share:
         detail = f"{share:.0%} of the {kind} shows the expected edge"
         return TechniqueFailure(name, StatusReason.NO_FEATURES_DETECTED, detail)
-    # Segments that scatter more than all that was granted to them are as much less certain (Birge 1932).
-    information = fit.relief.information / max(fit.relief.chi2_per_segment, 1.0)
+    # Segments that scatter more than all that was granted to them, or that belong to a rendering which as a whole does
+    # (a haze, a wrong law), are as much less certain (Birge 1932).
+    information = fit.relief.information / max(fit.relief.chi2_per_segment, fit.misfit, 1.0)
     settled = settle(information, fit.pivot_vu, context)
     pivot = predicted_place(context, fit.offset_vu, fit.rotation_rad, settled.pivot_vu)
     at_edge, at_edge_rotation = body_edge_flags(settled, fit.offset_vu, fit.rotation_rad, context, options)

@@ -24,6 +24,8 @@ _LONG_FACTORS = np.array([0.0, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0])
 _LONG_REACH_DEG = 40.0
 # Factor on the expected relief from which a wrong shape is thought of.
 _ODD_FACTOR = 1.3
+# Long-wave error of a shape without a catalogue's figure, over its relief.
+_UNKNOWN_LONG = 1.0
 # A weight this small is an outlier's; it keeps the covariance finite.
 _LEAST_WEIGHT = 1e-4
 
@@ -214,14 +216,16 @@ def _likeliest(
         k = int(np.argmin(np.abs(_FACTORS - f)))
         return float(prior[k]) + score(f, g), f
 
-    plain = best_short(0.0)
-    if plain[1] <= _ODD_FACTOR and start[1] == 0.0:
-        return plain[1], 0.0
+    # Of a shape that nobody vouches for a long-wave error is part of what is not known: a short arc cannot show it.
+    least = 0.0 if all(f.known for f in fields.values()) else _UNKNOWN_LONG
+    plain = best_short(least)
+    if plain[1] <= _ODD_FACTOR and start[1] <= least:
+        return plain[1], least
     # Reliefs far beyond what was expected: short waves and a wrong shape are weighed against each other.
     scored = [
-        (float(p) + s, f, float(g))
+        (float(p) + s, f, max(float(g), least))
         for g, p in zip(_LONG_FACTORS, long_prior, strict=True)
-        for s, f in [best_short(float(g))]
+        for s, f in [best_short(max(float(g), least))]
     ]
     _, short, long_ = max(scored)
     return short, long_
