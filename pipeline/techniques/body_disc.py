@@ -35,7 +35,7 @@ class BodyDiscOptions(TechniqueOptions):
     search: BodySearchOptions = BodySearchOptions()
     errors: ModelErrorOptions = ModelErrorOptions()
     min_correlation: float = Field(
-        0.4, ge=0, lt=1, description="correlation of the fit, over what noise allows, below which it is spurious"
+        0.7, ge=0, lt=1, description="correlation of the fit, over what noise allows, below which it is spurious"
     )
     largest_drift_px: float = Field(6.0, gt=0, le=100, description="how far the fit may go from where it began")
 

@@ -26,6 +26,7 @@ _LONG_REACH_DEG = 40.0
 _ODD_FACTOR = 1.3
 # Long-wave error of a shape without a catalogue's figure, over its relief.
 _UNKNOWN_LONG = 1.0
+_SHORT_ARC_DEG = 100.0
 # A weight this small is an outlier's; it keeps the covariance finite.
 _LEAST_WEIGHT = 1e-4
 
@@ -124,13 +125,14 @@ def fit_relief(
     bodies = sorted(set(segments.body.tolist()))
     near, far = _correlations(segments, fields)
     albedo = _albedo(segments)
+    span = float(np.degrees(np.arccos(np.clip((segments.direction @ segments.direction.T).min(), -1.0, 1.0))))
     common = {b: fields[b].common_px for b in bodies}
     weight = np.ones(len(segments))
     short, long_ = 1.0, 0.0
     for _ in range(_ROUNDS):
         noise = segments.sigma_px**2 / np.maximum(weight, _LEAST_WEIGHT)
         base = np.diag(noise) + _common(segments, common) + albedo
-        short, long_ = _likeliest(segments.shift_px, design, base, near, far, (short, long_), fields, options)
+        short, long_ = _likeliest(segments.shift_px, design, base, near, far, (short, long_), fields, span, options)
         covariance = base + short**2 * near + long_**2 * far
         step, information, solved = _solve(segments.shift_px, design, covariance)
         residual = segments.shift_px - design @ step
@@ -199,6 +201,7 @@ def _likeliest(
     far: FloatArray,
     start: tuple[float, float],
     fields: dict[int, Field_],
+    span_deg: float,
     options: ReliefOptions,
 ) -> tuple[float, float]:
     """Factors of both fields by restricted likelihood and prior, one after the other."""
@@ -216,8 +219,9 @@ def _likeliest(
         k = int(np.argmin(np.abs(_FACTORS - f)))
         return float(prior[k]) + score(f, g), f
 
-    # Of a shape that nobody vouches for a long-wave error is part of what is not known: a short arc cannot show it.
-    least = 0.0 if all(f.known for f in fields.values()) else _UNKNOWN_LONG
+    # A long-wave error is part of what is not known of a shape that nobody vouches for, and of any shape on a short
+    # arc, which cannot show it.
+    least = 0.0 if all(f.known for f in fields.values()) and span_deg > _SHORT_ARC_DEG else _UNKNOWN_LONG
     plain = best_short(least)
     if plain[1] <= _ODD_FACTOR and start[1] <= least:
         return plain[1], least
