@@ -94,8 +94,8 @@ def test_derivatives_have_numerical_twins() -> None:
         assert np.sqrt(((mine - twin) ** 2).mean()) < 0.06 * np.sqrt((twin**2).mean())
     scene = _scene((_body(place, RADIUS_PX, 60.0),))
     wide, narrow = (_template(scene.with_sigma(float(np.sqrt(SIGMA**2 + d)))).image for d in (0.02, -0.02))
-    twin = (wide - narrow) / 0.04
-    assert np.sqrt(((template.widening - twin) ** 2).mean()) < 0.05 * np.sqrt((twin**2).mean())
+    wider = (wide - narrow) / 0.04
+    assert np.sqrt(((template.widening - wider) ** 2).mean()) < 0.05 * np.sqrt((wider**2).mean())
 
 
 def test_spin_is_the_turn_of_the_shading() -> None:
@@ -170,7 +170,7 @@ def test_correlation_is_that_of_direct_sums() -> None:
     values = ncc_map(level, template)
     assert values.shape == (11, 13)
     # image(x) = template(x - d): the cut begins at 5 - d.
-    assert np.unravel_index(values.argmax(), values.shape) == (5 + 2, 6 - 3)
+    assert tuple(map(int, np.unravel_index(values.argmax(), values.shape))) == (5 + 2, 6 - 3)
     assert values.max() == pytest.approx(1.0, abs=1e-4)
     assert ncc_around(level, template, (2, -3), 1)[1, 1] == pytest.approx(values[7, 3], abs=1e-4)
     for i, j in ((0, 0), (4, 8), (10, 12)):
