@@ -68,8 +68,9 @@ def _mark_features(axes: object, features: Mapping[str, Json]) -> None:
         u, v = columns["measured_u_px"][mask], columns["measured_v_px"][mask]
         width = 0.6 if pieces else 1.2
         plot(u, v, marker=marker, ms=mark, mew=width, color=colour, label=f"{label} ({int(mask.sum())})", **style)
-    joins_u = np.stack([columns["predicted_u_px"][used], columns["measured_u_px"][used]])
-    joins_v = np.stack([columns["predicted_v_px"][used], columns["measured_v_px"][used]])
+    joined = np.flatnonzero(used)[:: 12 if pieces else 1]
+    joins_u = np.stack([columns["predicted_u_px"][joined], columns["measured_u_px"][joined]])
+    joins_v = np.stack([columns["predicted_v_px"][joined], columns["measured_v_px"][joined]])
     plot(joins_u, joins_v, color=_USED, lw=0.5)
     axes.legend(loc="upper right", fontsize=8, framealpha=0.85)  # type: ignore[attr-defined]
 
