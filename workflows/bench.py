@@ -36,7 +36,7 @@ from workflows.task import ImageRunner
 OUTPUT = Path("outputs/bench.json")
 _FLOOR_SHAPE = (1152, 1344)
 _WARM_UP = 3
-_REPEATS = 12
+_REPEATS = 4
 
 
 @dataclass(frozen=True)
