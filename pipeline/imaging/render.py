@@ -444,6 +444,8 @@ def blur_image(cells: Cells, window: Window, sigma_px: float) -> Image:
 
 
 def _filtered(cells: Image, kernel_v: FloatArray, kernel_u: FloatArray, window: Window, over: int) -> Image:
+    if not window.pixels:
+        return np.zeros((window.rows, window.cols), np.float32)
     plane = cv2.sepFilter2D(cells, cv2.CV_32F, kernel_u, kernel_v, borderType=cv2.BORDER_REPLICATE)
     if over > 1:
         plane = cv2.resize(plane, (window.cols, window.rows), interpolation=cv2.INTER_AREA)
