@@ -333,7 +333,9 @@ def _solve(
             lever = rotation_lever(block)
             prior[2] = 1e6 * gram[2, 2] + 1e-12
     gram = gram + np.diag(prior + 1e-12 * np.diag(gram))
-    values = np.linalg.solve(gram, pull)
+    # A body that a step has carried out of the frame leaves parameters that no pixel shows.
+    seen = bool((np.diag(gram) > 0).all())
+    values = np.linalg.solve(gram, pull) if seen else np.full(len(gram), np.nan)
     return _Solution(np.asarray(values), gram, prior, design, weight, target - design @ values, size, lever)
 
 
