@@ -48,7 +48,7 @@ def edge_field(image: Image, bad: BoolArray, sigma_dn: Image | FloatArray, scale
     EdgeField
         For :func:`pipeline.techniques.lm.lm_subpixel_refine` and searches.
     """
-    smooth = cv2.GaussianBlur(image, (0, 0), scale_px)
+    smooth = _smoothed(image, bad, scale_px)
     half = np.array([-0.5, 0.0, 0.5])
     one = np.ones(1)
     dv = cv2.sepFilter2D(smooth, cv2.CV_32F, one, half)
@@ -63,6 +63,15 @@ def edge_field(image: Image, bad: BoolArray, sigma_dn: Image | FloatArray, scale
     for plane in (dv, du, strength):
         plane[near_bad] = 0.0
     return EdgeField(dv, du, strength)
+
+
+def _smoothed(image: Image, bad: BoolArray, scale_px: float) -> Image:
+    """Gaussian means of what is measured: a gap must not look like a step, whose flanks reach beyond the filter."""
+    if not bad.any():
+        return np.asarray(cv2.GaussianBlur(image, (0, 0), scale_px), np.float32)
+    total = cv2.GaussianBlur(np.where(bad, np.float32(0.0), image), (0, 0), scale_px)
+    share = cv2.GaussianBlur((~bad).astype(np.float32), (0, 0), scale_px)
+    return np.asarray(total / np.maximum(share, np.float32(1e-6)), np.float32)
 
 
 @numba.njit(cache=True, nogil=True)

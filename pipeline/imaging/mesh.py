@@ -150,10 +150,19 @@ def _fill(cells, cover, depth, places, points, facets, light, shadow, axes, star
                 if value > 0.0:
                     here = (p * places[i, 2] * points[i] + q * places[j, 2] * points[j] + r * places[k, 2] * points[k])
                     here = here / nearness
-                    s = round((axes[0] @ here - start[0]) / step)
-                    t = round((axes[1] @ here - start[1]) / step)
-                    inside = 0 <= s < shadow.shape[0] and 0 <= t < shadow.shape[1]
-                    if inside and shadow[s, t] > axes[2] @ here + bias:
+                    s = floor((axes[0] @ here - start[0]) / step)
+                    t = floor((axes[1] @ here - start[1]) / step)
+                    inside = 0 <= s < shadow.shape[0] - 1 and 0 <= t < shadow.shape[1] - 1
+                    # In grazing light a surface rises by many cells from one to the next; of the four around a point
+                    # one is always below it, unless something else stands there.
+                    level = axes[2] @ here + bias
+                    if (
+                        inside
+                        and shadow[s, t] > level
+                        and shadow[s + 1, t] > level
+                        and shadow[s, t + 1] > level
+                        and shadow[s + 1, t + 1] > level
+                    ):
                         value = 0.0
                 cells[y, x] = value
                 cover[y, x] = 1.0

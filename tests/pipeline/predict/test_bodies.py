@@ -115,7 +115,7 @@ def test_bodies_hide_and_shade_each_other_as_traced_rays_say() -> None:
     hiding = body_at(PINHOLE, (24.0, 40.0), 6.0, 40.0, 0.0, name="HIDING", range_km=0.9e5)
     # One shade stands beside the disc in the field, the other beyond the field: both darken the planet.
     shades = tuple(
-        Body(name, None, planet.position_km + times * radius * sun + aside * radius, np.full(3, share * radius), TILTED, sun)
+        Body(name, None, planet.position_km + radius * (times * sun + aside), np.full(3, share * radius), TILTED, sun)
         for name, times, aside, share in (
             ("SHADE", 3.0, np.array([0.0, 0.3, 0.0]), 0.25), ("UNSEEN", 30.0, np.array([0.0, -0.4, 0.0]), 0.2)
         )
