@@ -384,6 +384,18 @@ class Template:
     widening: Image
     spin: Image | None = None
 
+    def part(self, window: Window) -> "Template":
+        """What covers a window inside the template's own."""
+        rows, cols = window.slices_in(self.window)
+
+        def cut(plane: Image) -> Image:
+            return np.ascontiguousarray(plane[rows, cols])
+
+        return Template(
+            window, cut(self.image), cut(self.along_v), cut(self.along_u), cut(self.night), cut(self.cover),
+            cut(self.widening), None if self.spin is None else cut(self.spin),
+        )  # fmt: skip
+
 
 def gaussian_kernels(sigma: float) -> tuple[FloatArray, FloatArray]:
     """Sampled Gaussian and its derivative, for correlation (as OpenCV filters).

@@ -273,8 +273,12 @@ class BodyScene:
         if key not in self._templates:
             views = self.views_at(self.attitude(offset_vu, rotation_rad))
             rows, cols = self.state.camera_model.shape_vu
-            window = self.around(views, Window(0, 0, rows, cols))
-            self._templates[key] = views, self.render(views, window)
+            array = Window(0, 0, rows, cols)
+            window = self.around(views, array)
+            # The blur carries light into the array from beyond its border.
+            blur_px = min(int(np.ceil(4.0 * self.sigma_px)) + 1, _CANVAS_SKY_PX)
+            wide = self.around(views, array.grown(blur_px, blur_px)) if window.pixels else window
+            self._templates[key] = views, self.render(views, wide).part(window)
         return self._templates[key]
 
     def views_at(self, attitude: FloatArray) -> tuple[BodyView, ...]:

@@ -67,7 +67,10 @@ def light(
     shape: tuple[int, int], balls: tuple[Ball, ...], places_vu: FloatArray, rotation_rad: float, sigma_px: float
 ) -> FloatArray:
     """Blurred light of balls at given places, 1 where the Sun stands overhead."""
-    v, u = ((np.arange(n * OVER) + 0.5) / OVER - 0.5 for n in shape)
+    # Light from beyond the frame is blurred into it.
+    pad = int(np.ceil(5.0 * sigma_px))
+    rows, cols = (n + 2 * pad for n in shape)
+    v, u = ((np.arange(n * OVER) + 0.5) / OVER - 0.5 - pad for n in (rows, cols))
     fine = np.zeros((len(v), len(u)))
     for ball, place in sorted(zip(balls, places_vu, strict=True), key=lambda pair: pair[0].nearness):
         y, x = (v[:, None] - place[0]) / ball.radius_px, (u[None, :] - place[1]) / ball.radius_px
@@ -75,8 +78,8 @@ def light(
         sun = ball.sun_vuz(rotation_rad)
         lit = np.clip(y * sun[0] + x * sun[1] - np.sqrt(np.clip(1.0 - r2, 0.0, None)) * sun[2], 0.0, None)
         fine = np.where(r2 < 1.0, lit, fine)
-    blurred = scipy.ndimage.gaussian_filter(fine, sigma_px * OVER, truncate=4.0, mode="nearest")
-    return np.asarray(blurred.reshape(shape[0], OVER, shape[1], OVER).mean(axis=(1, 3)))
+    blurred = scipy.ndimage.gaussian_filter(fine, sigma_px * OVER, truncate=4.0)
+    return np.asarray(blurred.reshape(rows, OVER, cols, OVER).mean(axis=(1, 3))[pad:-pad, pad:-pad])
 
 
 def ball_scene(

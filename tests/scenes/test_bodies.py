@@ -5,9 +5,10 @@ import pytest
 
 from pipeline.ensemble import _CombinedEstimate
 from pipeline.navigate import Navigation, NavigationOptions, navigate
+from pipeline.predict.bodies import BodyPredictionOptions, predict_bodies
 from pipeline.records import FloatArray, StarTable
 from pipeline.status import Status, StatusReason, status_of
-from tests.scenes.ball_scene import Ball, BallScene, ball_scene
+from tests.scenes.ball_scene import Ball, BallScene, ball_scene, light
 
 TECHNIQUES = ("BodyDiscCorrelateNav", "BodyLimbNav", "BodyTerminatorNav", "BodyBlobNav")
 MARGIN = 15.0
@@ -136,3 +137,49 @@ def test_a_body_beyond_the_margin_is_not_looked_for() -> None:
     navigation = _navigate(scene)
     assert navigation.reason is StatusReason.NO_FEATURES_PREDICTED
     assert [fate.reason for fate in navigation.bodies] == ["outside_field"]
+
+
+def test_templates_at_the_frames_border_have_the_light_that_is_blurred_in() -> None:
+    ball, sigma, step = Ball((165.0, 138.4), 44.8, 89.0, 73.0), 1.4, 0.05
+    state = ball_scene(np.random.default_rng(0), (ball,), (0.0, 0.0), sigma_px=sigma).state
+    _, template = predict_bodies(state, sigma, BodyPredictionOptions()).template(np.zeros(2), 0.0)
+    window = template.window
+    assert window.v0 + window.rows == 160
+    assert window.u0 + window.cols == 180
+
+    def drawn(dv: float, du: float) -> FloatArray:
+        place = np.add([ball.place_vu], (dv, du))
+        return light((160, 180), (ball,), place, 0.0, sigma)[window.v0 :, window.u0 :]
+
+    along_v = (drawn(-step, 0.0) - drawn(step, 0.0)) / (2.0 * step)
+    along_u = (drawn(0.0, -step) - drawn(0.0, step)) / (2.0 * step)
+    for mine, expected in ((template.image, drawn(0.0, 0.0)), (template.along_v, along_v), (template.along_u, along_u)):
+        assert np.abs(mine - expected).max() < 0.01 * np.abs(expected).max()
+
+
+@pytest.mark.slow
+def test_bodies_that_the_frame_cuts_are_never_sure_lies() -> None:
+    """Spheres of all sizes and phases across the border: answers are covered by their sigmas, or none are given."""
+    rng = np.random.default_rng(21)
+    pulls, answered = [], 0
+    for _ in range(60):
+        radius = float(np.exp(rng.uniform(np.log(5.0), np.log(60.0))))
+        along, gap = rng.uniform(20.0, 140.0), rng.uniform(-0.8, 0.8) * radius
+        place = ((along, gap), (along, 179.0 + gap), (gap, along), (159.0 + gap, along))[rng.integers(4)]
+        planted = tuple(rng.uniform(-0.8, 0.8, 2) * MARGIN)
+        predicted = (float(place[0] - planted[0]), float(place[1] - planted[1]))
+        ball = Ball(predicted, radius, rng.uniform(0.0, 150.0), rng.uniform(0.0, 360.0))
+        scene = ball_scene(rng, (ball,), planted, sigma_px=rng.uniform(0.5, 1.5))
+        navigation = _navigate(scene)
+        if navigation.reason is not StatusReason.NAVIGATED:
+            assert status_of(navigation.reason) is not Status.ERROR
+            continue
+        answered += 1
+        estimate = _answer(navigation)
+        # Directions of a long, thin error are its covariance's own.
+        values, vectors = np.linalg.eigh(estimate.covariance)
+        pulls.append((estimate.offset_vu - scene.offset_vu) @ vectors / np.sqrt(values))
+    assert answered >= 45
+    assert np.abs(pulls).max() < 3.5
+    # Of a smooth sphere more is known than is granted to an unknown surface.
+    assert np.sqrt(np.mean(np.square(pulls))) < 1.2

@@ -1,6 +1,7 @@
 """The limb's known inward bias must be absent: lit spheres drawn by brute force, measured where they are."""
 
 import numpy as np
+import pytest
 import scipy.ndimage
 
 from pipeline.frame import FrameOptions, make_frame
@@ -54,6 +55,7 @@ def _residual(rng: np.random.Generator) -> float:
     return float(np.average(good.shift_px, weights=good.sigma_px**-2.0))
 
 
+@pytest.mark.slow
 def test_limbs_are_not_drawn_inward() -> None:
     rng = np.random.default_rng(0)
     residuals = np.array([_residual(rng) for _ in range(DISCS)])
