@@ -104,7 +104,7 @@ def law(body: Body, phase_rad: float, mu0: FloatArray, mu: FloatArray) -> FloatA
         return seeliger
     g = np.degrees(phase_rad)
     weight = min(max(1.0 - 0.019 * g + 2.42e-4 * g**2 - 1.46e-6 * g**3, 0.0), 1.0)
-    return weight * seeliger + (1.0 - weight) * lit
+    return np.asarray(weight * seeliger + (1.0 - weight) * lit)
 
 
 def first_hit(radii_km: FloatArray, start_km: FloatArray, rays: FloatArray) -> tuple[FloatArray, BoolArray]:

@@ -10,7 +10,7 @@ from pipeline.geometry.pointing import corrected_attitude
 from pipeline.geometry.rotations import rotation_about
 from pipeline.imaging.render import Template, Window, ray_grid
 from pipeline.predict.bodies import BodyPredictionOptions, BodyScene, form_of, predict_bodies, reach_px, view_body
-from pipeline.records import Body, CameraModel, FloatArray, Photometry
+from pipeline.records import Body, CameraModel, FloatArray, Image, Photometry
 from tests.scenes.body_scene import body_at, body_state, camera_of, corner_camera, seen, trace
 
 SHAPE = (64, 64)
@@ -32,7 +32,7 @@ def _template(scene: BodyScene) -> Template:
     return scene.render(scene.views, WINDOW)
 
 
-def _agree(mine: FloatArray, truth: FloatArray, peak: float, rms: float) -> None:
+def _agree(mine: FloatArray | Image, truth: FloatArray, peak: float, rms: float) -> None:
     difference = np.abs(mine - truth)
     assert float(difference.max()) < peak
     assert float(np.sqrt((difference**2).mean())) < rms

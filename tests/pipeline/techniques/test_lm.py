@@ -22,7 +22,7 @@ def _box(half_v: float, half_u: float, count: int = 80) -> FloatArray:
     t = np.linspace(-1.0, 1.0, count)
     one = np.ones(count)
     sides = [(one * s, t) for s in (-1, 1)] + [(t, one * s) for s in (-1, 1)]
-    return PIVOT + np.concatenate([np.stack(side, axis=1) for side in sides]) * [half_v, half_u]
+    return np.asarray(PIVOT + np.concatenate([np.stack(side, axis=1) for side in sides]) * [half_v, half_u])
 
 
 def _box_distance(half_v: float, half_u: float, offset: FloatArray, theta: float) -> Image:
