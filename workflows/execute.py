@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 from uuid import uuid4
@@ -120,7 +120,9 @@ def _run_on(client: Client, plan: Plan, on_done: Listener, on_ready: Callable[[s
         for ref in lost:
             for again in _drain(client, plugin.name, [ref], 1, on_done):
                 on_done(_record_loss(plan.setup, again))
-        client.unregister_worker_plugin(plugin.name)
+        # All images are answered: a worker that dies now, and so does not hear of it, changes nothing.
+        with suppress(CommClosedError):
+            client.unregister_worker_plugin(plugin.name)
     except CommClosedError as error:
         raise PilotageError("the scheduler is gone; run the same command again to go on") from error
 

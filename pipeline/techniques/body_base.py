@@ -75,8 +75,10 @@ def cut_out(scene: BodyScene, frame: Frame, offset_vu: FloatArray, rotation_rad:
     Returns
     -------
     Cutout or None
-        None where no body reaches the array.
+        None where no body reaches the array, or where a fit has lost all sense.
     """
+    if not np.isfinite([*offset_vu, rotation_rad]).all():
+        return None
     offset, rotation = scene.quantised(offset_vu, rotation_rad)
     views, template = scene.template(offset, rotation)
     if not views or not template.window.pixels:

@@ -140,7 +140,10 @@ def _brightest(
     v, u = np.nonzero(chosen)
     weight = np.clip(excess[chosen].astype(float), 0.0, None)
     centre = np.array([weight @ v, weight @ u]) / weight.sum() + [region.v0, region.u0]
-    template = scene.render(scene.views, view.box.grown(4, 4))
+    window = view.box.grown(4, 4)
+    if window.intersection(scene.canvas) != window:
+        return TechniqueFailure(NAME, StatusReason.NO_FEATURES_PREDICTED, "the body is predicted too far outside")
+    template = scene.render(scene.views, window)
     image = template.image.astype(float)
     tv, tu = np.indices(image.shape)
     predicted = np.array([(image * tv).sum(), (image * tu).sum()]) / max(float(image.sum()), 1e-30)

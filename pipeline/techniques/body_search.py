@@ -249,7 +249,8 @@ def _judge(peaks: list[Peak], pyramid: _Pyramid, scene: BodyScene, context: NavC
     apart = _SAME_PEAK * max(view.diameter_px for view in scene.views)
     rivals = [p for p in peaks[1:] if np.hypot(*np.subtract(p.offset_vu, best.offset_vu)) > max(apart, 2.0 * factor)]
     fit = _log_misfit(best.compared)
-    tries = float(np.prod([2 * n + 1 for n in pyramid.surplus])) / max(scene.views[-1].diameter_px, 1.0) ** 2
+    # A limb is as sharp as the point spread, so nearly every pixel of the margin is a try of its own.
+    tries = float(np.prod([2 * n + 1 for n in pyramid.surplus]))
     # Three parameters were fitted; a place is as good as its likelihood over that of all others.
     doubt = max(tries, 1.0) * np.exp(np.clip(count / 2.0 * fit + 3.0, -700.0, 50.0))
     doubt += sum(np.exp(np.clip(count / 2.0 * (fit - _log_misfit(p.compared)), -700.0, 0.0)) for p in rivals)

@@ -196,3 +196,15 @@ def test_spikes_are_struck_pixels_and_no_crescent() -> None:
     assert found[30, 40:42].all()
     assert not found[45, 8:27].any()
     assert np.count_nonzero(found) <= 7
+
+
+def test_nothing_is_drawn_beyond_the_rays() -> None:
+    scene = _scene((_body((33.0, 37.0), RADIUS_PX, 60.0),))
+    wide = scene.canvas.grown(40, 40)
+    template = scene.render(scene.views, wide)
+    inside = np.zeros((wide.rows, wide.cols), bool)
+    inside[scene.canvas.slices_in(wide)] = True
+    assert np.isfinite(template.image).all()
+    assert template.image[inside].max() > 0.5
+    far = scipy.ndimage.distance_transform_edt(~inside) > 6.0
+    assert not template.image[far].any()
