@@ -15,6 +15,7 @@ from catalogs.instruments import InstrumentBlock, SpiceNames
 from catalogs.kernels import Kernel, load, reason_of
 from pipeline.camera import field_of_view
 from pipeline.errors import ContractError, GeometryError
+from pipeline.predict.bodies import may_shade
 from pipeline.predict.stars import reach_px
 from pipeline.records import Attitude, Body, FloatArray, Spacecraft, State
 from pipeline.status import StatusReason
@@ -328,7 +329,7 @@ def _bodies_in_field(
     bodies = [body for candidate in known if (body := _seen(candidate, state, names, models)) is not None]
     inside = [body for body in bodies if _reaches(body, direction, half)]
     for body in bodies:
-        if any(body is other for other in inside) or any(_may_shade(body, other) for other in inside):
+        if any(body is other for other in inside) or any(may_shade(body, other) for other in inside):
             yield body
 
 
@@ -353,14 +354,6 @@ def _reaches(body: Body, direction: FloatArray, half_rad: float) -> bool:
     distance = float(np.linalg.norm(body.position_km))
     inside = distance <= size
     return inside or _separation(direction, body.position_km) <= half_rad + float(np.arcsin(size / distance))
-
-
-def _may_shade(body: Body, other: Body) -> bool:
-    """Whether a body stands between another and the Sun, by their spheres."""
-    gap = body.position_km - other.position_km
-    along = float(gap @ other.sun_direction_j2000)
-    aside = float(np.linalg.norm(gap - along * other.sun_direction_j2000))
-    return body is not other and along > 0 and aside < float(body.radii_km.max() + other.radii_km.max())
 
 
 def _separation(a: FloatArray, b: FloatArray) -> float:

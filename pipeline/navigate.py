@@ -133,7 +133,7 @@ def navigate(
         on_stage("body_disc")
         outcomes += _body_pass(scene, body_frame, fix, context, options.techniques, on_stage)
         if len(predicted):
-            star_frame = without_light_of(_lit_pixels(scene, fix, frame), frame, state, options.frame)
+            star_frame = without_light_of(_covered_pixels(fix, frame), frame, state, options.frame)
             on_stage("body_mask")
     if len(predicted) or not len(scene):
         outcomes += _first_pass(predicted, star_frame, context, options, on_stage)
@@ -185,7 +185,7 @@ def _body_pass(
     return outcomes
 
 
-def _lit_pixels(scene: BodyScene, fix: DiscFix | str, frame: Frame) -> BoolArray:
+def _covered_pixels(fix: DiscFix | str, frame: Frame) -> BoolArray:
     """Pixels that bodies cover where they were found; where they were not, no pixel is known to be a body's."""
     covered = np.zeros(frame.raw.shape, bool)
     if isinstance(fix, DiscFix):

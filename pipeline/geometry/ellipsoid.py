@@ -180,19 +180,3 @@ def silhouette_form(radii_km: FloatArray, observer_km: FloatArray) -> FloatArray
     inverse = np.diag(1.0 / radii_km**2)
     start = inverse @ observer_km
     return np.asarray(np.outer(start, start) - (observer_km @ start - 1.0) * inverse)
-
-
-def scaled_silhouette(radii_km: FloatArray) -> float:
-    """Radius of the sphere of the same volume, which stands for the body's size in one figure.
-
-    Parameters
-    ----------
-    radii_km
-        (3,) semi-axes.
-
-    Returns
-    -------
-    float
-        Kilometres.
-    """
-    return float(np.cbrt(np.prod(radii_km)))

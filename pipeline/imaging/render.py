@@ -120,8 +120,6 @@ class Solid(Record):
         (3,) unit vector toward the Sun.
     law, parameter
         Scattering law, see ``illumination.law_of``.
-    brightness
-        Factor on its radiance, relative to the other bodies.
     shadowed_by
         (m, 12) centre and rows of the form of bodies that may stand between it and the Sun.
     """
@@ -131,7 +129,6 @@ class Solid(Record):
     sun: FloatArray
     law: int
     parameter: float
-    brightness: float
     shadowed_by: FloatArray
 
     def __post_init__(self) -> None:
@@ -198,7 +195,7 @@ def _shade(ex, ey, disc, cx, cy, cz, bc, cbc, form, sun, law, parameter, occlude
 
 
 @numba.njit(cache=True, nogil=True)
-def _draw(cells, cover, slopes, over, inner, centre, form, sun, law, parameter, brightness, occluders):  # type: ignore[no-untyped-def]
+def _draw(cells, cover, slopes, over, inner, centre, form, sun, law, parameter, occluders):  # type: ignore[no-untyped-def]
     """Add one solid to the cells, in front of what they hold.
 
     The ray is written d = centre/z + e: then ``disc = cBc/z^2 + 2 e.Bc/z + (e.Bc)^2 - (cBc - 1) eBe`` has no
@@ -241,7 +238,7 @@ def _draw(cells, cover, slopes, over, inner, centre, form, sun, law, parameter, 
                 continue
             if disc > reach and inner == 1:
                 light = _shade(x, y, disc, cx, cy, cz, bc, cbc, form, sun, law, parameter, occluders)
-                cells[i, j] = brightness * light
+                cells[i, j] = light
                 cover[i, j] = 1.0
                 continue
             samples = inner if disc > reach else _LIMB_SAMPLES
@@ -259,7 +256,7 @@ def _draw(cells, cover, slopes, over, inner, centre, form, sun, law, parameter, 
             if covered:
                 # Counting samples would make a limb ragged, and a ragged limb seems to show a rotation.
                 share = _covered_share(disc, rise_v, rise_u) if disc <= reach else 1.0
-                cells[i, j] = brightness * light / covered * share + (1.0 - share) * cells[i, j]
+                cells[i, j] = light / covered * share + (1.0 - share) * cells[i, j]
                 cover[i, j] += (1.0 - cover[i, j]) * share
 
 
@@ -337,7 +334,7 @@ def render_cells(
         inside = np.s_[rows.start * over : rows.stop * over, cols.start * over : cols.stop * over]
         _draw(
             cells.light[inside], cells.cover[inside], _grid_for(rays, part), over, inner, solid.centre_km, solid.form,
-            solid.sun, solid.law, solid.parameter, solid.brightness, solid.shadowed_by,
+            solid.sun, solid.law, solid.parameter, solid.shadowed_by,
         )  # fmt: skip
 
 

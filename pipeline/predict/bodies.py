@@ -425,18 +425,31 @@ def _solid(view: BodyView, bodies: tuple[Body, ...]) -> Solid:
     """Body for the renderer, with whatever of the State may shade it, in the field or not."""
     law, parameter = law_of(view.body.photometry, view.body.photometry_parameter, view.phase_rad)
     shading = [
-        _occluder(other, view) for other in bodies if other.name != view.body.name and _may_shade(other, view.body)
+        _occluder(other, view) for other in bodies if other.name != view.body.name and may_shade(other, view.body)
     ]
     occluders = np.array(shading).reshape(-1, 12)
-    return Solid(view.centre_km, form_of(view), view.sun, law, parameter, 1.0, occluders)
+    return Solid(view.centre_km, form_of(view), view.sun, law, parameter, occluders)
 
 
-def _may_shade(other: Body, body: Body) -> bool:
-    """Whether a body stands between another and the Sun, by their spheres."""
+def may_shade(other: Body, body: Body) -> bool:
+    """Whether a body stands between another and the Sun, by their spheres.
+
+    Parameters
+    ----------
+    other
+        The one that may throw a shadow.
+    body
+        The one that it may fall upon.
+
+    Returns
+    -------
+    bool
+        Never of a body and itself.
+    """
     gap = other.position_km - body.position_km
     along = float(gap @ body.sun_direction_j2000)
     aside = float(np.linalg.norm(gap - along * body.sun_direction_j2000))
-    return along > 0 and aside < float(other.radii_km.max() + body.radii_km.max())
+    return other is not body and along > 0 and aside < float(other.radii_km.max() + body.radii_km.max())
 
 
 def _occluder(other: Body, view: BodyView) -> FloatArray:

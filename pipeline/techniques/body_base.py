@@ -244,27 +244,6 @@ def body_edge_flags(
     return bool((there >= options.margin_at_edge_fraction * bound).any()), False
 
 
-def unexplained_share(residual: FloatArray, light: FloatArray, noise_dn: FloatArray) -> float:
-    """Share of an image's light that a rendering leaves over, noise aside.
-
-    Parameters
-    ----------
-    residual
-        (n,) image less model, DN.
-    light
-        (n,) of the model over the sky, DN.
-    noise_dn
-        (n,) 1 sigma of a pixel.
-
-    Returns
-    -------
-    float
-        Zero for a perfect rendering.
-    """
-    left = np.sqrt(np.clip((residual**2 - noise_dn**2).sum(), 0.0, None))
-    return float(left / max(float(np.sqrt((light**2).sum())), 1e-30))
-
-
 def settle(information: FloatArray, pivot_vu: FloatArray, context: NavContext) -> Settled:
     """Keep a rotation that is observed; else move the pivot to where the rotation does not matter.
 

@@ -106,15 +106,16 @@ def _find_part(scene: BodyScene, frame: Frame, context: NavContext, options: Bod
     sharp, fit = fitted
     # Where the rotation is open the offset at the array centre may go far without any body moving.
     before = _places(scene, found.offset_vu, found.rotation_rad)
-    drift = float(np.hypot(*(_places(scene, fit.offset_vu, fit.rotation_rad) - before).T).max())
+    after = _places(scene, fit.offset_vu, fit.rotation_rad)
+    drift = max((float(np.hypot(*(after[name] - before[name]))) for name in before.keys() & after.keys()), default=0.0)
     if drift > options.largest_drift_px + 0.1 * max(view.diameter_px for view in scene.views):
         return f"the fit ran {drift:.1f} px away from the correlation's peak"
     return DiscFix(found, fit, sharp)
 
 
-def _places(scene: BodyScene, offset_vu: FloatArray, rotation_rad: float) -> FloatArray:
-    """(n, 2) centres of the bodies under a pointing."""
-    return np.array([view.centre_vu for view in scene.views_at(scene.attitude(offset_vu, rotation_rad))])
+def _places(scene: BodyScene, offset_vu: FloatArray, rotation_rad: float) -> dict[str, FloatArray]:
+    """(2,) centres of the bodies under a pointing, by name; one behind the camera has none."""
+    return {view.body.name: view.centre_vu for view in scene.views_at(scene.attitude(offset_vu, rotation_rad))}
 
 
 def _sharpened(

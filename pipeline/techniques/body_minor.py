@@ -38,10 +38,10 @@ def find_rotation(scene: BodyScene, fit: TemplateFit, frame: Frame, context: Nav
         Change of the rotation, radians; None where no rotation stands out.
     """
     views, _ = scene.template(*scene.quantised(fit.offset_vu, fit.rotation_rad))
-    placed = [view for view in views if view.body.name in scene.minor().names]
-    stamps = [stamp for view in placed if (stamp := _stamp(view, scene)) is not None]
-    arms = [float(np.hypot(*(view.centre_vu - fit.pivot_vu))) for view in placed]
-    if not stamps or max(arms) < 1.0:
+    small = [view for view in views if view.body.name in scene.minor().names]
+    stamped = [(view, stamp) for view in small if (stamp := _stamp(view, scene)) is not None]
+    arms = [float(np.hypot(*(view.centre_vu - fit.pivot_vu))) for view, _ in stamped]
+    if max(arms, default=0.0) < 1.0:
         return None
     bound = context.max_rotation_rad
     step = _STEP_PX / max(arms)
@@ -51,10 +51,10 @@ def find_rotation(scene: BodyScene, fit: TemplateFit, frame: Frame, context: Nav
         low, high = max(low, -reach), min(high, reach)
     thetas = np.linspace(low, high, int(np.clip((high - low) / step, 3, 20000)))
     gain = np.zeros(len(thetas))
-    for view, stamp in zip(placed, stamps, strict=False):
+    for view, stamp in stamped:
         gain += np.array([_gain(view, stamp, fit, float(theta), frame) for theta in thetas])
     best = int(np.argmax(gain))
-    apart = np.abs(thetas - thetas[best]) * max(arms) > max(3.0, max(view.diameter_px for view in placed))
+    apart = np.abs(thetas - thetas[best]) * max(arms) > max(3.0, max(view.diameter_px for view, _ in stamped))
     rival = float(gain[apart].max()) if apart.any() else 0.0
     return float(thetas[best]) if gain[best] - max(rival, 0.0) > _SURE else None
 

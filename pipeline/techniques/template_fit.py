@@ -98,12 +98,6 @@ class TemplateFit:
         """Brightness, sky and night side, DN."""
         return Levels(self.scale_dn, self.level_dn, self.night_dn)
 
-    def model_dn(self) -> FloatArray:
-        """(rows, cols) what the fit expects in the cutout, without the sky's slope."""
-        template = self.cutout.template
-        light = self.scale_dn * template.image.astype(float) + self.night_dn * template.night
-        return np.asarray(self.level_dn + light + self.scale_dn * self.variance_px2 * template.widening)
-
 
 @dataclass(frozen=True, eq=False)
 class _Samples:

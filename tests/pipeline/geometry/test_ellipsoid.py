@@ -12,7 +12,6 @@ from pipeline.geometry.ellipsoid import (
     intersect,
     is_visible,
     limb_points,
-    scaled_silhouette,
     silhouette_form,
     sub_point,
     surface_normal,
@@ -152,7 +151,6 @@ def test_the_sub_point_is_on_the_line_to_the_centre() -> None:
     assert _level(RADII, point) == pytest.approx(1.0)
     assert_allclose(np.cross(point, direction), 0.0, atol=1e-12)
     assert point @ direction > 0
-    assert scaled_silhouette(np.array([8.0, 1.0, 1.0])) == pytest.approx(2.0)
 
 
 @given(positive, positive, positive, component, component, component, st.floats(1.01, 1e6))
