@@ -13,11 +13,11 @@ from spiceypy.utils.exceptions import NotFoundError, SpiceyError
 from spiceypy.utils.support_types import SpiceDLADescr
 
 from pipeline.errors import ContractError, GeometryError
+from pipeline.geometry.shape import ICQ_FACES, Shape, signed_volume
 from pipeline.records import FloatArray, TriangleMesh
 from pipeline.status import StatusReason
 
 IntArray = NDArray[np.int64]
-_ICQ_FACES = 6
 _DSK_MARKS = (b"DAS/DSK", b"NAIF/DAS")
 # Binary formats that a DAS file record names behind its counts (NAIF's required reading on DAS).
 _DAS_FORMATS = (b"LTL-IEEE", b"BIG-IEEE")
@@ -58,25 +58,33 @@ def read_shape(data: bytes, name: str) -> TriangleMesh:
         raise GeometryError(StatusReason.GEOMETRY_INVALID, f"shape {name}: {error}") from error
 
 
-def volume_km3(mesh: TriangleMesh) -> float:
-    """Volume that a closed mesh encloses, by the divergence theorem.
+def read_solid(data: bytes, name: str) -> Shape:
+    """Shape of a shape file: its mesh, and its grid where it is one of Gaskell's.
 
     Parameters
     ----------
-    mesh
-        Shape.
+    data
+        The file's bytes.
+    name
+        For messages.
 
     Returns
     -------
-    float
-        km^3, negative where the facets face inward.
+    Shape
+        Facets outward.
+
+    Raises
+    ------
+    GeometryError
+        If the file is damaged, or its surface encloses nothing.
     """
-    return _signed_volume(mesh.vertices_km, mesh.facets)
-
-
-def _signed_volume(vertices: FloatArray, facets: IntArray) -> float:
-    a, b, c = (vertices[facets[:, corner]] for corner in range(3))
-    return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6.0)
+    mesh = read_shape(data, name)
+    lines = data.split(None, 1)[1].splitlines() if data.split(None, 1)[0].isdigit() else []
+    rows = [line for line in lines if line.strip() and not line.lstrip().startswith(b"#")]
+    side = int(data.split(None, 1)[0]) if rows else 0
+    if len(rows) != ICQ_FACES * (side + 1) ** 2:
+        return Shape(mesh)
+    return Shape(mesh, _icq_vertices(rows).reshape(ICQ_FACES, side + 1, side + 1, 3))
 
 
 def _parse(data: bytes) -> tuple[FloatArray, IntArray]:
@@ -88,7 +96,7 @@ def _parse(data: bytes) -> tuple[FloatArray, IntArray]:
     if lines[0].split()[0] in (b"v", b"f", b"o", b"g", b"s", b"vn", b"vt", b"mtllib", b"usemtl"):
         return _obj(lines)
     counts = lines[0].split()
-    if len(counts) == 1 and (side := _count(counts[0])) > 0 and len(lines) == 1 + _ICQ_FACES * (side + 1) ** 2:
+    if len(counts) == 1 and (side := _count(counts[0])) > 0 and len(lines) == 1 + ICQ_FACES * (side + 1) ** 2:
         return _icq(lines[1:], side)
     return _plates(lines)
 
@@ -146,18 +154,22 @@ def _fan(polygons: IntArray) -> IntArray:
     return np.concatenate([polygons[:, [0, k, k + 1]] for k in range(1, corners - 1)])
 
 
+def _icq_vertices(lines: Sequence[bytes]) -> FloatArray:
+    return _numbers([b" ".join(line.split(None, 3)[:3]) for line in lines], 3, "vertex")
+
+
 def _icq(lines: Sequence[bytes], side: int) -> tuple[FloatArray, IntArray]:
     """Gaskell's implicitly connected quadrilaterals: six faces of (Q + 1)^2 vertices, row by row.
 
     Rows may carry an albedo and more behind x, y, z. Adjacent faces repeat the vertices of their common edge; these
     become one. Faces need not wind the same way, so each is turned by the sign of its own volume about the origin.
     """
-    vertices = _numbers([b" ".join(line.split(None, 3)[:3]) for line in lines], 3, "vertex")
+    vertices = _icq_vertices(lines)
     grid = np.arange((side + 1) ** 2).reshape(side + 1, side + 1)
     a, b, c, d = (part.ravel() for part in (grid[:-1, :-1], grid[1:, :-1], grid[1:, 1:], grid[:-1, 1:]))
     face = np.concatenate([np.column_stack([a, b, c]), np.column_stack([a, c, d])])
-    facets = [face + k * (side + 1) ** 2 for k in range(_ICQ_FACES)]
-    facets = [part if _signed_volume(vertices, part) >= 0 else part[:, ::-1] for part in facets]
+    facets = [face + k * (side + 1) ** 2 for k in range(ICQ_FACES)]
+    facets = [part if signed_volume(vertices, part) >= 0 else part[:, ::-1] for part in facets]
     unique, place = np.unique(vertices, axis=0, return_inverse=True)
     return unique, place.reshape(-1)[np.concatenate(facets)]
 
@@ -240,7 +252,7 @@ def _checked(vertices: FloatArray, facets: IntArray) -> TriangleMesh:
         raise ShapeProblem(f"facets name vertices outside 1 to {len(vertices)}")
     a, b, c = (vertices[facets[:, corner]] for corner in range(3))
     facets = facets[(np.cross(b - a, c - a) != 0).any(axis=1)]
-    volume = _signed_volume(vertices, facets)
+    volume = signed_volume(vertices, facets)
     extent = float(np.ptp(vertices, axis=0).max())
     # The volume about the origin is that of the body only if the surface is closed; a sheet or a point has none.
     if not len(facets) or abs(volume) <= 1e-9 * extent**3:

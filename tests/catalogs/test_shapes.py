@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 import spiceypy
 
-from catalogs.shapes import read_shape, volume_km3
+from catalogs.shapes import read_shape, read_solid
 from pipeline.errors import GeometryError
+from pipeline.geometry.shape import icq_adjacency, volume_km3
 from pipeline.records import FloatArray, TriangleMesh
 from pipeline.status import StatusReason
 from tests.scenes.data import DATA, needs_data
@@ -157,3 +158,24 @@ def test_phoebe_is_closed_and_as_large_as_published() -> None:
     assert mesh.vertices_km.shape == (6 * 64**2 + 2, 3)
     # Mean radius 106.5 +- 0.7 km (Thomas 2010, Icarus 208, 395).
     assert (3 * volume_km3(mesh) / (4 * np.pi)) ** (1 / 3) == pytest.approx(106.5, abs=0.7)
+
+
+def test_a_grid_keeps_its_faces() -> None:
+    text = icq_of_cube(4, 5.0)
+    shape = read_solid(text.encode(), "cube")
+    assert shape.icq_km is not None
+    assert np.array_equal(shape.icq_km.reshape(-1, 3), np.array(text.split()[1:], float).reshape(-1, 3))
+    assert shape.volume_km3 == pytest.approx(1000.0, rel=1e-13)
+    assert read_solid(OBJ.encode(), "box").icq_km is None
+    plates = f"8 12\n{rows('', CORNERS)}{rows('', FACETS)}"
+    assert read_solid(plates.encode(), "box").icq_km is None
+
+
+@needs_data
+def test_phoebe_joins_face_to_face() -> None:
+    shape = read_solid((DATA / "phoebe" / "phoebe_ICQ_Q64.TXT").read_bytes(), "phoebe")
+    assert shape.icq_km is not None
+    joined = icq_adjacency(shape.icq_km)
+    # Top and bottom never touch, and every face has the other four around it.
+    assert all(set(joined[face, :, 0]) == set(range(6)) - {face, 5 - face} for face in (0, 5))
+    assert all(len(set(joined[face, :, 0])) == 4 for face in range(6))
