@@ -15,6 +15,7 @@ LEVELS = (
     ("records",),
     ("camera",),
     ("geometry",),
+    ("pose",),
     ("imaging",),
     ("frame",),
     ("predict",),
@@ -26,12 +27,14 @@ LEVELS = (
 )
 # Within a folder: modules that the others of it may import, lowest first. All others are equals.
 FOUNDATIONS = {
-    "geometry": ("rotations",),
+    "geometry": ("rotations", "shape", "maplet"),
     "imaging": ("psf", "illumination", "render"),
+    "pose": ("records", "se3", "normalise", "refine", "pnp", "ransac", "graph", "estimator", "triangulation"),
     "predict": ("bodies",),
     "techniques": (
         "base", "star_fit", "star_match", "star_search", "star_inventory", "body_base", "body_search", "model_errors",
-        "template_fit", "body_minor", "contour_fit", "lm", "line_search", "relief",
+        "template_fit", "body_minor", "contour_fit", "lm", "line_search", "relief", "ring_units", "ring_fit", "ring_search",
+        "ring_answer",
     ),
 }  # fmt: skip
 OUTSIDE_OF_SCIENCE = {
@@ -41,8 +44,8 @@ OUTSIDE_OF_SCIENCE = {
 # Schemas are Arrow's, which is not a file.
 ORDER_OF_CATALOGS = (
     "instruments", "label_text", "raw_images", "fits_images", "pds3_images", "gdal_images", "images", "labels",
-    "bodies", "shapes", "geometry", "header", "sidecar", "index_tables", "selection", "archive", "listing", "kernels",
-    "spice", "star_sources", "stars",
+    "bodies", "shapes", "geometry", "ring_catalog", "header", "sidecar", "index_tables", "selection", "archive", "listing", "kernels",
+    "spice", "star_sources", "stars", "spc_text", "spc_files", "maplets",
 )  # fmt: skip
 
 

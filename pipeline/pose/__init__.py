@@ -1,0 +1,1 @@
+"""Camera poses from points on a body: perspective-n-point, factor graphs, triangulation, arcs."""

@@ -1,0 +1,148 @@
+"""Factors of GTSAM: one image's matches on its pose, with the points' own uncertainty."""
+
+from collections.abc import Callable
+
+import gtsam
+import numpy as np
+
+from pipeline.pose.records import Pose
+from pipeline.pose.refine import scene_scale, whitening
+from pipeline.pose.se3 import SE3Utils
+from pipeline.records import FloatArray
+
+# The ideal plane is seen by a camera of unit focal length.
+_IDEAL = gtsam.Cal3_S2(1.0, 1.0, 0.0, 0.0, 0.0)
+# A point at or behind the camera has no projection; so large a residual turns every step back.
+_BEHIND = 1e6
+
+PoseSymbol = Callable[[int], int]
+
+
+def pose_key(index: int) -> int:
+    """Key of an image's pose."""
+    return int(gtsam.symbol("x", index))
+
+
+def point_key(index: int) -> int:
+    """Key of a point."""
+    return int(gtsam.symbol("l", index))
+
+
+def resection_factor(key: int, points: FloatArray, xy: FloatArray, covariance: FloatArray) -> gtsam.CustomFactor:
+    """One factor for all matches of an image with exact points.
+
+    Parameters
+    ----------
+    key
+        Of the pose, body_from_camera.
+    points
+        (n, 3) in the graph's frame and unit.
+    xy
+        (n, 2) on the ideal plane.
+    covariance
+        (n, 2, 2) there.
+
+    Returns
+    -------
+    gtsam.CustomFactor
+        2 n whitened rows with analytic derivatives along GTSAM's tangent (rotation, translation).
+    """
+    white = whitening(covariance)
+
+    def error(this: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[FloatArray] | None) -> FloatArray:
+        pose = values.atPose3(this.keys()[0])
+        camera = (points - pose.translation()) @ pose.rotation().matrix()
+        ahead = camera[:, 2] > 0
+        depth = np.where(ahead, camera[:, 2], 1.0)
+        x, y = (camera[:, :2] / depth[:, None]).T
+        if jacobians is not None:
+            jacobians[0] = np.asfortranarray((white @ _plane_jacobian(x, y, depth)).reshape(-1, 6))
+        residual = np.where(ahead[:, None], np.stack([x, y], axis=1) - xy, _BEHIND)
+        return np.asarray((white @ residual[:, :, None]).ravel())
+
+    return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(2 * len(points)), [key], error)
+
+
+def _plane_jacobian(x: FloatArray, y: FloatArray, depth: FloatArray) -> FloatArray:
+    """(n, 2, 6), d(x, y)/d(rotation, translation) of the camera in its own frame."""
+    jacobian = np.zeros((len(x), 2, 6))
+    near = 1.0 / depth
+    jacobian[:, 0, 0], jacobian[:, 0, 1], jacobian[:, 0, 2] = x * y, -1.0 - x * x, y
+    jacobian[:, 0, 3], jacobian[:, 0, 5] = -near, near * x
+    jacobian[:, 1, 0], jacobian[:, 1, 1], jacobian[:, 1, 2] = 1.0 + y * y, -x * y, -x
+    jacobian[:, 1, 4], jacobian[:, 1, 5] = -near, near * y
+    return jacobian
+
+
+def match_graph(
+    key: int, points: FloatArray, xy: FloatArray, covariance: FloatArray, point_covariance: FloatArray | None
+) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
+    """Factors of one image's matches.
+
+    Parameters
+    ----------
+    key
+        Of the pose.
+    points
+        (n, 3) in the graph's frame and unit.
+    xy
+        (n, 2) on the ideal plane.
+    covariance
+        (n, 2, 2) there.
+    point_covariance
+        (n, 3, 3) in the graph's unit; then every point is a variable with a prior. None for exact points.
+
+    Returns
+    -------
+    tuple
+        The factors, and start values of the points (none if exact).
+    """
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    if point_covariance is None:
+        graph.add(resection_factor(key, points, xy, covariance))
+        return graph, values
+    for i, point in enumerate(points):
+        noise = gtsam.noiseModel.Gaussian.Covariance(covariance[i])
+        graph.add(gtsam.GenericProjectionFactorCal3_S2(xy[i], noise, key, point_key(i), _IDEAL))
+        prior = gtsam.noiseModel.Gaussian.Covariance(point_covariance[i])
+        graph.add(gtsam.PriorFactorPoint3(point_key(i), point, prior))
+        values.insert(point_key(i), point)
+    return graph, values
+
+
+def posterior(
+    start: Pose, points_km: FloatArray, xy: FloatArray, covariance: FloatArray, point_covariance_km2: FloatArray | None
+) -> tuple[Pose, FloatArray]:
+    """Maximum a posteriori pose and its marginal covariance.
+
+    Parameters
+    ----------
+    start
+        A pose near the answer.
+    points_km
+        (n, 3) body-fixed.
+    xy
+        (n, 2) on the ideal plane.
+    covariance
+        (n, 2, 2) there.
+    point_covariance_km2
+        (n, 3, 3), or None.
+
+    Returns
+    -------
+    tuple
+        Pose; (6, 6) covariance of errors (x, y, z, rx, ry, rz), km and rad.
+    """
+    centre, scale = scene_scale(points_km)
+    key = pose_key(0)
+    spread = None if point_covariance_km2 is None else point_covariance_km2 / scale**2
+    graph, values = match_graph(key, (points_km - centre) / scale, xy, covariance, spread)
+    values.insert(key, SE3Utils.to_gtsam(Pose(start.camera_from_body, (start.position_km - centre) / scale)))
+    params = gtsam.LevenbergMarquardtParams()
+    params.setRelativeErrorTol(1e-10)
+    result = gtsam.LevenbergMarquardtOptimizer(graph, values, params).optimize()
+    marginal = gtsam.Marginals(graph, result).marginalCovariance(key)
+    found = SE3Utils.from_gtsam(result.atPose3(key))
+    unit = np.array([scale, scale, scale, 1.0, 1.0, 1.0])
+    errors = SE3Utils.error_from_gtsam(marginal, found.camera_from_body) * np.outer(unit, unit)
+    return Pose(found.camera_from_body, found.position_km * scale + centre), errors
