@@ -55,6 +55,9 @@ class ArchiveDescription(Options):
     instrument: str | None = Field(None, description="a camera block; by default the header is recognised")
     stars: str | list[str | StarTableRef] = Field("per-image", description="built-in names, tables, or per-image")
     settings: dict[str, object] = Field(default_factory=dict, description="instrument settings that win")
+    rings: str | None = Field(
+        None, min_length=1, description="ring catalogue (YAML), relative to the root; wins for its planet"
+    )
     bodies: dict[str, BodyBlock] = Field(
         default_factory=dict, description="what this archive knows of bodies, by name; wins key by key"
     )

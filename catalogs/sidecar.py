@@ -10,6 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from catalogs.bodies import NO_MODELS, BodyBlock, BodyModels, nearest_first
 from catalogs.geometry import et_of_utc, first_problem, plausible, settings_of
 from catalogs.instruments import InstrumentBlock
+from catalogs.ring_catalog import RingBlock
 from pipeline.errors import ContractError, GeometryError
 from pipeline.geometry.rotations import matrix_from_quaternion
 from pipeline.records import (
@@ -19,6 +20,8 @@ from pipeline.records import (
     Detector,
     FloatArray,
     Photometry,
+    RingKind,
+    RingSystem,
     Spacecraft,
     State,
     TriangleMesh,
@@ -84,6 +87,35 @@ class _SidecarBody(_Block):
     haze_km: float | None = Field(None, ge=0)
 
 
+class _SidecarMode(_Block):
+    m: int
+    amplitude_km: float
+    longitude_deg: float = 0.0
+
+
+class _SidecarFeature(_Block):
+    name: str = Field(min_length=1)
+    kind: RingKind
+    a_km: float = Field(gt=0, le=1e9)
+    ae_km: float = Field(0.0, ge=0)
+    long_peri_deg: float = 0.0
+    width_km: float | None = Field(0.0, ge=0, le=1e9)
+    tau: float | None = Field(None, ge=0)
+    sigma_a_km: float | None = Field(None, ge=0)
+    modes: tuple[_SidecarMode, ...] = ()
+    a_sin_i_km: float = Field(0.0, ge=0)
+    long_node_deg: float = 0.0
+
+
+class _SidecarRings(_Block):
+    planet: str = Field(min_length=1)
+    position_km: Place
+    plane_from_j2000_wxyz: Quaternion
+    opening_sun_deg: float = Field(ge=-90, le=90)
+    sun_direction_j2000: Vector | None = None
+    features: tuple[_SidecarFeature, ...] = ()
+
+
 class Sidecar(_Block):
     """The serialised State, format ``geometry/1``."""
 
@@ -102,6 +134,7 @@ class Sidecar(_Block):
     attitude: _AttitudeBlock
     spacecraft: _SpacecraftBlock | None = None
     bodies: tuple[_SidecarBody, ...] | None = None
+    rings: _SidecarRings | None = None
 
 
 def sidecar_image_id(data: bytes) -> str | None:
@@ -170,7 +203,7 @@ def state_from_sidecar(
             attitude=_sidecar_attitude(sidecar.attitude),
             spacecraft=Spacecraft(_vector(spacecraft.position_km_ssb), _vector(spacecraft.velocity_kms_ssb)),
             settings=settings_of(block, sidecar, overrides),
-            bodies=nearest_first(_body(body, models) for body in sidecar.bodies or ()),
+            bodies=nearest_first(_body(body, models) for body in sidecar.bodies or ()), rings=_rings(sidecar.rings),
         ))  # fmt: skip
     except ValidationError as error:
         raise GeometryError(StatusReason.GEOMETRY_INVALID, f"sidecar: {first_problem(error)}") from error
@@ -239,6 +272,20 @@ def _figure(said: _SidecarBody, block: BodyBlock, models: BodyModels) -> tuple[F
     if mesh is None:
         raise ContractError(f"{said.name}: neither radii_km nor a shape file")
     return None, mesh
+
+
+def _rings(said: _SidecarRings | None) -> RingSystem | None:
+    """Rings at the image's time, as the sidecar has them."""
+    if said is None:
+        return None
+    features = tuple(
+        RingBlock.model_validate({**entry.model_dump(), "width_km": entry.width_km or 0.0}).feature(0.0)
+        for entry in said.features
+    )
+    return RingSystem(
+        said.planet, np.array(said.position_km), _rotation(said.plane_from_j2000_wxyz, "rings: quaternion"),
+        float(np.radians(said.opening_sun_deg)), _vector(said.sun_direction_j2000), features,
+    )  # fmt: skip
 
 
 def _vector(values: Vector | None) -> FloatArray | None:

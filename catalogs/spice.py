@@ -13,11 +13,13 @@ from catalogs.bodies import BodyModels, nearest_first
 from catalogs.geometry import first_problem, plausible, settings_of
 from catalogs.instruments import InstrumentBlock, SpiceNames
 from catalogs.kernels import Kernel, load, reason_of
+from catalogs.ring_catalog import RingCatalog, rings_of
 from pipeline.camera import field_of_view
 from pipeline.errors import ContractError, GeometryError
-from pipeline.predict.bodies import may_shade
+from pipeline.geometry.astrometry import SPEED_OF_LIGHT_KM_S
+from pipeline.predict.body_view import may_shade
 from pipeline.predict.stars import reach_px
-from pipeline.records import Attitude, Body, FloatArray, Spacecraft, State
+from pipeline.records import Attitude, Body, FloatArray, RingSystem, Spacecraft, State
 from pipeline.status import StatusReason
 
 # Converged light time and stellar aberration: what the camera saw (NAIF's required reading on SPK).
@@ -152,7 +154,7 @@ def focal_length_notes(blocks: Mapping[str, InstrumentBlock]) -> list[str]:
 
 def state_from_spice(
     label: Exposed, image_id: str, camera: tuple[InstrumentBlock, str | None], overrides: Mapping[str, object],
-    known: Sequence[Candidate], models: BodyModels,
+    known: Sequence[Candidate], models: BodyModels, rings: Sequence[RingCatalog] = (),
 ) -> State:  # fmt: skip
     """State of one image from the loaded kernels.
 
@@ -170,6 +172,8 @@ def state_from_spice(
         Bodies of the loaded kernels.
     models
         What catalogues say of bodies.
+    rings
+        Ring catalogues; of one planet the last wins.
 
     Returns
     -------
@@ -198,8 +202,12 @@ def state_from_spice(
             attitude=_attitude(block.spice, et, label), spacecraft=_spacecraft(block.spice, et, label.mid_utc),
             settings=settings_of(block, mode, overrides),
         )  # fmt: skip
-        bodies = nearest_first(_bodies_in_field(state, block.spice, known, models))
-        return plausible(replace(state, bodies=bodies))
+        bodies = list(_bodies_in_field(state, block.spice, known, models))
+        system, planet = _rings_in_field(state, block.spice, known, rings)
+        if planet is not None and all(body.name != planet.name for body in bodies):
+            # A planet beside the field still hides its rings and throws its shadow on them.
+            bodies += [body for body in [_seen(planet, state, block.spice, models)] if body is not None]
+        return plausible(replace(state, bodies=nearest_first(bodies), rings=system))
     except ValidationError as error:
         raise GeometryError(StatusReason.GEOMETRY_INVALID, f"settings: {first_problem(error)}") from error
     except ContractError as error:
@@ -345,6 +353,66 @@ def _seen(candidate: Candidate, state: State, names: SpiceNames, models: BodyMod
     block = models.block_of(candidate.name).model_copy(update={"naif_id": candidate.naif_id})
     sun = _direction_to_sun(candidate.naif_id, state.et - light_time)
     return block.body(candidate.name, np.array(place), orientation, sun, candidate.radii_km, models.mesh_of(block))
+
+
+def _rings_in_field(
+    state: State, names: SpiceNames, known: Sequence[Candidate], catalogs: Sequence[RingCatalog]
+) -> tuple[RingSystem | None, Candidate | None]:
+    """Rings, and their planet, of the nearest planet whose outermost ring reaches into the field."""
+    axis, half = field_of_view(state.camera_model, reach_px(state))
+    direction = state.attitude.camera_from_j2000.T @ axis
+    found: list[tuple[float, RingSystem, Candidate]] = []
+    for candidate in known:
+        catalog = rings_of(catalogs, candidate.name)
+        system = None if catalog is None else _ring_system(candidate, catalog, state, names, direction)
+        if system is None:
+            continue
+        distance = float(np.linalg.norm(system.position_km))
+        size = max(f.a_km + f.ae_km + f.width_km for f in system.features)
+        reaches = distance <= size or (
+            _separation(direction, system.position_km) <= half + float(np.arcsin(size / distance))
+        )
+        if reaches:
+            found.append((distance, system, candidate))
+    if not found:
+        return None, None
+    _, system, candidate = min(found, key=lambda entry: entry[0])
+    return system, candidate
+
+
+def _ring_system(
+    candidate: Candidate, catalog: RingCatalog, state: State, names: SpiceNames, boresight: FloatArray
+) -> RingSystem | None:
+    """Rings as seen: plane of the planet's equator, longitudes from its ascending node on the J2000 equator.
+
+    Light time and aberration differ between the planet and rings far from it. In the planet's frame of rest a point at
+    X is seen along ``X - v |X| / c`` with v the planet's velocity past the spacecraft; one place of the centre serves
+    the whole field when that is taken for the ring point in its middle.
+    """
+    try:
+        moving, _ = spiceypy.spkezr(str(candidate.naif_id), state.et, _J2000, "NONE", str(names.spacecraft_id))
+    except SpiceyError:
+        return None
+    position, velocity = np.array(moving[:3]), np.array(moving[3:])
+    left = state.et - float(np.linalg.norm(position)) / SPEED_OF_LIGHT_KM_S
+    orientation = _orientation(candidate, left)
+    if orientation is None:
+        return None
+    pole = catalog.pole_sign * orientation[2]
+    node = np.cross([0.0, 0.0, 1.0], pole)
+    length = float(np.linalg.norm(node))
+    node = node / length if length > 0 else np.array([1.0, 0.0, 0.0])
+    plane = np.stack([node, np.cross(pole, node), pole])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        reach = float((pole @ position) / (pole @ boresight))
+    distance = float(np.linalg.norm(position))
+    if not 0.0 < reach < 2.0 * distance:
+        reach = distance
+    sun = _direction_to_sun(candidate.naif_id, left)
+    return RingSystem(
+        candidate.name, position - velocity * (reach / SPEED_OF_LIGHT_KM_S), plane,
+        float(np.arcsin(np.clip(pole @ sun, -1.0, 1.0))), sun, catalog.at(left),
+    )  # fmt: skip
 
 
 def _reaches(body: Body, direction: FloatArray, half_rad: float) -> bool:

@@ -12,9 +12,11 @@ from pipeline.geometry.rotations import quaternion_from_matrix
 from pipeline.navigate import Navigation, corrected_sigma_px
 from pipeline.options import Options
 from pipeline.predict.bodies import BodyFate
+from pipeline.predict.rings import RingFate
 from pipeline.records import FloatArray, State
 from pipeline.status import Rank, Status, StatusReason, status_of
 from pipeline.techniques.base import FeatureTable, TechniqueFailure, TechniqueResult, covariance_of
+from pipeline.techniques.ring_edges import RingEdgeTable
 
 Json = str | int | float | bool | None | list["Json"] | dict[str, "Json"]
 
@@ -103,6 +105,8 @@ def build_metadata_dict(
     document |= _answer(estimate, state)
     document["pointing"] = _pointing(estimate, state, navigation.reason)
     document["bodies"] = [_body(fate) for fate in navigation.bodies]
+    document["rings"] = [_ring(fate) for fate in navigation.rings]
+    document["ring_edges"] = None if navigation.ring_edges is None else _ring_edges(navigation.ring_edges)
     document["frame"] = None if navigation.frame is None else _frame_figures(navigation.frame)
     answers: list[Json] = [_technique(result, estimate) for result in navigation.results]
     document["techniques"] = [*answers, *(_failure(failure) for failure in navigation.failures)]
@@ -137,7 +141,8 @@ def error_document(
         "schema": SCHEMA, "image_id": image_id, "mission": "UNKNOWN", "camera": "UNKNOWN", "time_utc": None, "et": None,
         "exposure_s": None, "status": status.value, "status_reason": reason.value, "detail": detail,
         "rank": Rank.FAILED.value, "confidence": None, "offset_px": None, "sigma_px": None, "covariance_px2": None,
-        "observable": None, "pointing": None, "bodies": [], "frame": None, "techniques": [], "label": label,
+        "observable": None, "pointing": None, "bodies": [], "rings": [], "ring_edges": None, "frame": None,
+        "techniques": [], "label": label,
         "provenance": _provenance(provenance),
     }  # fmt: skip
 
@@ -230,6 +235,24 @@ def _body(fate: BodyFate) -> Json:
         "name": fate.name, "centre_vu": centre, "diameter_px": round(fate.diameter_px, _PIXEL_DIGITS),
         "phase_deg": round(fate.phase_deg, _PIXEL_DIGITS), "left_out": fate.reason,
     }  # fmt: skip
+
+
+def _ring(fate: RingFate) -> Json:
+    return {
+        "name": fate.name, "kind": fate.kind, "visible_px": round(fate.visible_px, 1), "straight": fate.straight,
+        "left_out": fate.reason,
+    }  # fmt: skip
+
+
+def _ring_edges(table: RingEdgeTable) -> dict[str, Json]:
+    """Columns of the measured edges; a pixel may be metres or thousands of kilometres, so radii keep six decimals."""
+    digits = {"v_px": _PIXEL_DIGITS, "u_px": _PIXEL_DIGITS, "sigma_px": _PIXEL_DIGITS, "contrast_dn": 3, "weight": 3}
+    columns: dict[str, Json] = {"feature": table.feature.tolist(), "outer": table.outer.tolist()}
+    for name in (
+        "radius_km", "longitude_deg", "sigma_km", "predicted_km", "v_px", "u_px", "sigma_px", "contrast_dn", "weight",
+    ):  # fmt: skip
+        columns[name] = _numbers(getattr(table, name), digits.get(name, 6))
+    return columns
 
 
 def _technique(result: TechniqueResult, estimate: _CombinedEstimate | None) -> dict[str, Json]:

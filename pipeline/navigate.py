@@ -12,6 +12,7 @@ from pipeline.frame import Frame, FrameOptions, make_frame, without_light_of, wi
 from pipeline.imaging.detect import DetectionOptions, detect_point_sources
 from pipeline.options import Options
 from pipeline.predict.bodies import BodyFate, BodyPredictionOptions, BodyScene, predict_bodies
+from pipeline.predict.rings import RingFate, RingPredictionOptions, RingScene, predict_rings
 from pipeline.predict.stars import PredictedStars, StarPredictionOptions, predict_stars
 from pipeline.records import BoolArray, FloatArray, Image, StarTable, State
 from pipeline.status import StatusReason
@@ -24,6 +25,11 @@ from pipeline.techniques.body_limb import (
     body_limb_nav,
     body_terminator_nav,
 )
+from pipeline.techniques.ring_annulus import RingAnnulusOptions, ring_annulus_nav
+from pipeline.techniques.ring_edge import RingEdgeOptions, ring_edge_nav
+from pipeline.techniques.ring_edges import RingEdgeTable, ring_edge_table
+from pipeline.techniques.ring_fit import smoothed_variance
+from pipeline.techniques.ring_search import RingFix, find_rings
 from pipeline.techniques.star_field import StarFieldOptions, star_field_nav
 from pipeline.techniques.star_refine import StarRefineOptions, star_refine_nav
 from pipeline.techniques.star_unique import StarUniqueOptions, star_unique_nav
@@ -39,6 +45,8 @@ class TechniquesOptions(Options):
     BodyTerminatorNav: BodyTerminatorOptions = BodyTerminatorOptions()
     BodyDiscCorrelateNav: BodyDiscOptions = BodyDiscOptions()
     BodyBlobNav: BodyBlobOptions = BodyBlobOptions()
+    RingEdgeNav: RingEdgeOptions = RingEdgeOptions()
+    RingAnnulusNav: RingAnnulusOptions = RingAnnulusOptions()
 
 
 class NavigationOptions(Options):
@@ -48,6 +56,7 @@ class NavigationOptions(Options):
     detection: DetectionOptions = DetectionOptions()
     stars: StarPredictionOptions = StarPredictionOptions()
     body_prediction: BodyPredictionOptions = BodyPredictionOptions()
+    ring_prediction: RingPredictionOptions = RingPredictionOptions()
     techniques: TechniquesOptions = TechniquesOptions()
     ensemble: EnsembleOptions = Field(default_factory=EnsembleOptions)
 
@@ -70,6 +79,10 @@ class Navigation:
         How the image ends, and one line about it.
     bodies
         What became of each body of the State.
+    rings
+        What became of each feature of its rings.
+    ring_edges
+        Measured radii, None without a fit of rings.
     """
 
     state: State
@@ -80,6 +93,8 @@ class Navigation:
     reason: StatusReason
     detail: str
     bodies: tuple[BodyFate, ...] = ()
+    rings: tuple[RingFate, ...] = ()
+    ring_edges: RingEdgeTable | None = None
 
 
 StageListener = Callable[[str], None]
@@ -124,9 +139,11 @@ def navigate(
     on_stage("frame")
     predicted = predict_stars(stars, state, frame, options.stars)
     scene = predict_bodies(state, frame.spread.sigma_px, options.body_prediction)
+    rings = predict_rings(state, frame.spread.sigma_px, options.ring_prediction)
     on_stage("predict")
     outcomes: list[_Outcome] = []
     star_frame = frame
+    fix: DiscFix | str = "no bodies"
     if len(scene):
         body_frame = without_spikes(frame)
         fix = _find(scene, body_frame, context, options.techniques)
@@ -135,7 +152,12 @@ def navigate(
         if len(predicted):
             star_frame = without_light_of(_covered_pixels(fix, frame), frame, state, options.frame)
             on_stage("body_mask")
-    if len(predicted) or not len(scene):
+    ring_fix: RingFix | str = "no rings"
+    if len(rings):
+        ring_fix, answers = _ring_pass(rings, without_spikes(frame), fix, context, options.techniques)
+        outcomes += answers
+        on_stage("rings")
+    if len(predicted) or not (len(scene) or len(rings)):
         outcomes += _first_pass(predicted, star_frame, context, options, on_stage)
     first = _fuse(outcomes, context, state, options)
     usable = first is not None and first.reason in (StatusReason.NAVIGATED, StatusReason.NAVIGATED_AT_EDGE)
@@ -144,7 +166,41 @@ def navigate(
         on_stage("refine")
     estimate = _fuse(outcomes, context, state, options)
     on_stage("ensemble")
-    return replace(_conclude(state, frame, estimate, outcomes), bodies=scene.fates)
+    edges = _ring_edges(rings, ring_fix, estimate)
+    return replace(
+        _conclude(state, frame, estimate, outcomes), bodies=scene.fates, rings=rings.fates, ring_edges=edges
+    )
+
+
+def _ring_pass(
+    rings: RingScene, frame: Frame, disc: DiscFix | str, context: NavContext, techniques: TechniquesOptions
+) -> tuple[RingFix | str, list[_Outcome]]:
+    """Techniques on rings; from where bodies were found, if they were and the rings are there."""
+    edge, annulus = techniques.RingEdgeNav, techniques.RingAnnulusNav
+    if not (edge.enabled or annulus.enabled):
+        return "not looked for", []
+    variance = smoothed_variance(frame)
+    fix: RingFix | str = "not found"
+    if isinstance(disc, DiscFix):
+        start = (disc.fit.offset_vu, disc.fit.rotation_rad)
+        fix = find_rings(rings, frame, variance, start, context, edge.search)
+    if isinstance(fix, str) or fix.confidence < edge.min_confidence:
+        fix = find_rings(rings, frame, variance, None, context, edge.search)
+    outcomes: list[_Outcome] = []
+    if edge.enabled:
+        outcomes.append(ring_edge_nav(rings, fix, context, edge))
+    if annulus.enabled:
+        outcomes.append(ring_annulus_nav(rings, frame, variance, fix, context, annulus))
+    return fix, outcomes
+
+
+def _ring_edges(rings: RingScene, fix: RingFix | str, estimate: _CombinedEstimate | None) -> RingEdgeTable | None:
+    """Radii under the image's pointing, or, where that knows one direction, under the rings' own."""
+    if isinstance(fix, str) or estimate is None:
+        return None
+    if estimate.observable_vu is not None:
+        return ring_edge_table(rings, fix.fit, fix.fit.offset_vu, fix.fit.rotation_rad)
+    return ring_edge_table(rings, fix.fit, estimate.offset_vu, estimate.rotation_rad or 0.0)
 
 
 def _find(scene: BodyScene, frame: Frame, context: NavContext, techniques: TechniquesOptions) -> DiscFix | str:
@@ -180,7 +236,7 @@ def _body_pass(
         outcomes.append(body_terminator_nav(scene, frame, found.fit, confidence, context, options))
         on_stage("body_terminator")
     if techniques.BodyBlobNav.enabled:
-        outcomes.append(body_blob_nav(scene, frame, context, techniques.BodyBlobNav))
+        outcomes.append(body_blob_nav(scene, frame, found.fit if found else None, context, techniques.BodyBlobNav))
         on_stage("body_blob")
     return outcomes
 

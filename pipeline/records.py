@@ -275,6 +275,99 @@ class Body(Record):
             raise ContractError(f"{self.name}: sun_direction_j2000 is not a unit vector")
 
 
+class RingKind(StrEnum):
+    """What a ring feature is: two edges with something between them, or one edge of something wide."""
+
+    RINGLET = "ringlet"
+    GAP = "gap"
+    EDGE_OUTER = "edge_outer"
+    EDGE_INNER = "edge_inner"
+
+
+@dataclass(frozen=True, eq=False)
+class RingFeature(Record):
+    """A ringlet, a gap, or the edge of a ring, at the time when its light left it.
+
+    Attributes
+    ----------
+    name
+        Identity, unique in its system.
+    kind
+        Of an ``edge_outer`` the ring lies inside, of an ``edge_inner`` outside.
+    a_km, ae_km, long_peri_rad
+        Semi-major axis of the (inner) edge, its eccentricity times that, and longitude of pericentre.
+    width_km
+        Outer minus inner edge; zero for single edges.
+    tau
+        Normal optical depth: of the ringlet, of what is left in the gap, of an edge's denser side; None if unknown.
+    sigma_a_km
+        1 sigma by which both edges together may lie elsewhere; None where nobody says.
+    modes
+        (n, 3) azimuthal number m, amplitude in km and phase in radians: the radius loses
+        ``amplitude cos(m longitude - phase)``.
+    a_sin_i_km, long_node_rad
+        Height above the plane at the node plus a quarter turn, and longitude of the ascending node on the ring plane.
+    """
+
+    name: str
+    kind: RingKind
+    a_km: float
+    ae_km: float = 0.0
+    long_peri_rad: float = 0.0
+    width_km: float = 0.0
+    tau: float | None = None
+    sigma_a_km: float | None = None
+    modes: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
+    a_sin_i_km: float = 0.0
+    long_node_rad: float = 0.0
+
+    def __post_init__(self) -> None:
+        self._freeze(modes=(None, 3))
+        if not (self.a_km > 0 and 0 <= self.ae_km < self.a_km and self.width_km >= 0):
+            raise ContractError(f"{self.name}: a {self.a_km} km, ae {self.ae_km} km, width {self.width_km} km")
+
+
+@dataclass(frozen=True, eq=False)
+class RingSystem(Record):
+    """Rings of one planet as the camera sees them: light time and stellar aberration are in their place.
+
+    Attributes
+    ----------
+    planet
+        Name.
+    position_km
+        (3,) apparent centre, from the spacecraft, J2000 axes.
+    plane_from_j2000
+        (3, 3) x to the reference of longitudes, z to the pole.
+    opening_sun_rad
+        Elevation of the Sun over the plane, positive on the pole's side.
+    sun_direction_j2000
+        (3,) unit vector to the Sun, None where unknown (then nothing throws a shadow).
+    features
+        Edges to navigate by.
+    """
+
+    planet: str
+    position_km: FloatArray
+    plane_from_j2000: FloatArray
+    opening_sun_rad: float
+    sun_direction_j2000: FloatArray | None = None
+    features: tuple[RingFeature, ...] = ()
+
+    def __post_init__(self) -> None:
+        self._freeze(position_km=(3,), plane_from_j2000=(3, 3), sun_direction_j2000=(3,))
+        rotation = self.plane_from_j2000
+        if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-9) or np.linalg.det(rotation) < 0:
+            raise ContractError(f"rings of {self.planet}: plane_from_j2000 is not a rotation")
+        if not (np.isfinite(self.position_km).all() and np.linalg.norm(self.position_km) > 0):
+            raise ContractError(f"rings of {self.planet}: position {self.position_km.tolist()} km")
+
+    @property
+    def observer_km(self) -> FloatArray:
+        """(3,) the camera from the planet's centre, in the ring frame."""
+        return np.asarray(-self.plane_from_j2000 @ self.position_km)
+
+
 @dataclass(frozen=True)
 class State:
     """Geometry of one image, whichever provider filled it.
@@ -289,6 +382,8 @@ class State:
         Exposure, None when unknown.
     bodies
         Everything solid that can be in or near the field, the Sun aside; nearest first.
+    rings
+        Of the one ringed planet whose rings can be in the field.
     """
 
     image_id: str
@@ -303,6 +398,7 @@ class State:
     spacecraft: Spacecraft
     settings: InstrumentSettings
     bodies: tuple[Body, ...] = ()
+    rings: RingSystem | None = None
 
 
 @dataclass(frozen=True, eq=False)

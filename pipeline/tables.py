@@ -79,7 +79,7 @@ SCHEMAS: dict[str, pa.Schema] = {
         *_IDENTITY,
         _field("technique", _TEXT, "", "technique that looked for it"),
         _field("name", _TEXT, "", "catalogue name"),
-        _field("kind", _TEXT, "", "star, limb, terminator, disc or blob"),
+        _field("kind", _TEXT, "", "star, limb, terminator, disc, blob, ringlet, gap, edge_outer or edge_inner"),
         _field("predicted_v_px", _REAL, _PIXEL, "under the a-priori attitude"),
         _field("predicted_u_px", _REAL, _PIXEL, "under the a-priori attitude"),
         _field("measured_v_px", _REAL, _PIXEL, "null where not found"),
@@ -91,6 +91,20 @@ SCHEMAS: dict[str, pa.Schema] = {
         _field("snr", _REAL, "", "signal to noise: expected of a star, of the edge in a piece of limb or terminator"),
         _field("used", _FLAG, "", "took part in the fit"),
         _field("reason", _TEXT, "", "why not; empty where used"),
+    ]),
+    "ring_edges": pa.schema([
+        *_IDENTITY,
+        _field("feature", _TEXT, "", "catalogue name"),
+        _field("outer", _FLAG, "", "outer edge of a ringlet or gap"),
+        _field("radius_km", _REAL, "km", "radius in the ring plane at which the edge is seen, pointing corrected"),
+        _field("longitude_deg", _REAL, "deg", "longitude of the sample in the ring plane, from the plane's reference"),
+        _field("sigma_km", _REAL, "km", "1 sigma of the radius from the sample's own pixels, the pointing's aside"),
+        _field("predicted_km", _REAL, "km", "radius by the catalogue"),
+        _field("v_px", _REAL, _PIXEL, "where in the image"),
+        _field("u_px", _REAL, _PIXEL, "where in the image"),
+        _field("sigma_px", _REAL, _PIXEL, "1 sigma across the edge"),
+        _field("contrast_dn", _REAL, "DN", "brightness outside less inside"),
+        _field("weight", _REAL, "", "robust weight in the fit, 0 where the sample was not believed"),
     ]),
     "timings": pa.schema([
         *_IDENTITY,
@@ -230,4 +244,28 @@ def feature_columns(documents: Iterable[Mapping[str, Json]]) -> dict[str, list[J
                     values.extend(features[name])  # type: ignore[arg-type]
                 else:
                     values.extend([technique["technique"] if name == "technique" else document[name]] * count)
+    return columns
+
+
+def ring_edge_columns(documents: Iterable[Mapping[str, Json]]) -> dict[str, list[Json]]:
+    """Columns of table ``ring_edges`` for many images.
+
+    Parameters
+    ----------
+    documents
+        Images' JSON documents.
+
+    Returns
+    -------
+    dict
+        One list per column, all of one length.
+    """
+    columns: dict[str, list[Json]] = {name: [] for name in SCHEMAS["ring_edges"].names}
+    for document in documents:
+        edges = document.get("ring_edges")
+        if not isinstance(edges, dict):
+            continue
+        count = len(edges["feature"])  # type: ignore[arg-type]
+        for name, values in columns.items():
+            values.extend(edges[name] if name in edges else [document[name]] * count)  # type: ignore[arg-type]
     return columns

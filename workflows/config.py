@@ -19,6 +19,7 @@ from pipeline.imaging.detect import DetectionOptions
 from pipeline.navigate import NavigationOptions, TechniquesOptions
 from pipeline.options import Options
 from pipeline.predict.bodies import BodyPredictionOptions
+from pipeline.predict.rings import RingPredictionOptions
 from pipeline.predict.stars import StarPredictionOptions
 
 Tree = dict[str, object]
@@ -42,6 +43,7 @@ class Configuration(Options):
     detection: DetectionOptions = DetectionOptions()
     stars: StarPredictionOptions = StarPredictionOptions()
     body_prediction: BodyPredictionOptions = BodyPredictionOptions()
+    ring_prediction: RingPredictionOptions = RingPredictionOptions()
     techniques: TechniquesOptions = TechniquesOptions()
     orchestrator: OrchestratorOptions = OrchestratorOptions()
 
@@ -49,7 +51,7 @@ class Configuration(Options):
         """The part that steers one image."""
         return NavigationOptions(
             frame=self.frame, detection=self.detection, stars=self.stars,
-            body_prediction=self.body_prediction, techniques=self.techniques,
+            body_prediction=self.body_prediction, ring_prediction=self.ring_prediction, techniques=self.techniques,
             ensemble=self.orchestrator.ensemble,
         )  # fmt: skip
 

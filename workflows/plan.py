@@ -25,6 +25,7 @@ from catalogs.bodies import BodyBlock, merged_blocks
 from catalogs.geometry import first_problem
 from catalogs.kernels import Kernel, check_kernels
 from catalogs.listing import list_images
+from catalogs.ring_catalog import RingCatalog, built_in_rings, parse_rings
 from catalogs.spice import focal_length_notes
 from catalogs.star_sources import TableProblem, read_table
 from catalogs.stars import BUILT_IN_NAMES, StarIndex, added_index, build_index, built_in_index, cache_folder, open_index
@@ -60,6 +61,8 @@ class Setup:
         Version and digest of the code.
     kernels
         SPICE kernels in the order of loading.
+    rings
+        Ring catalogues, the archive's own last.
     """
 
     archive: Archive
@@ -70,6 +73,7 @@ class Setup:
     run_folder: RunFolder
     software: str
     kernels: tuple[Kernel, ...] = ()
+    rings: tuple[RingCatalog, ...] = ()
 
     def inputs_of(self, ref: ImageRef) -> tuple[str, ...]:
         """Paths, relative to the archive, whose bytes decide an image's answer."""
@@ -98,7 +102,8 @@ class Setup:
         bodies = {name: block.model_dump(mode="json") for name, block in self.bodies.items()}
         kernels = [(kernel.name, kernel.sha256) for kernel in self.kernels]
         parts: list[object] = [
-            self.configuration.digest(), self.software, description, bodies, list(self.star_digests), kernels
+            self.configuration.digest(), self.software, description, bodies, list(self.star_digests), kernels,
+            [catalog.model_dump(mode="json") for catalog in self.rings],
         ]  # fmt: skip
         return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
 
@@ -155,7 +160,7 @@ def make_plan(archive: Archive, configuration: Configuration, run_folder: RunFol
     setup = Setup(
         archive, configuration, tuple(index.path for index in indexes),
         tuple((index.name, index.sha256) for index in indexes), per_image, run_folder, software_id(),
-        open_kernels(archive, configuration, verify),
+        open_kernels(archive, configuration, verify), open_rings(archive),
     )  # fmt: skip
     every = list_images(archive, configuration.instruments)
     todo = [ref for ref in every if not _is_done(ref, setup, verify)]
@@ -168,6 +173,34 @@ def _check_settings(archive: Archive) -> None:
     except ValidationError as error:
         allowed = ", ".join(InstrumentSettings.model_fields)
         raise ConfigurationError(f"{archive.url}: settings.{first_problem(error)} (keys: {allowed})") from error
+
+
+def open_rings(archive: Archive) -> tuple[RingCatalog, ...]:
+    """Shipped ring catalogues and the archive's own.
+
+    Parameters
+    ----------
+    archive
+        The archive.
+
+    Returns
+    -------
+    tuple of RingCatalog
+        The archive's own last: it wins for its planet.
+
+    Raises
+    ------
+    ConfigurationError
+        If the archive names a catalogue that is not there or not valid.
+    """
+    path = archive.description.rings
+    if path is None:
+        return built_in_rings()
+    try:
+        data = archive.read(path)
+    except (FileNotFoundError, NotADirectoryError, IsADirectoryError) as error:
+        raise ConfigurationError(f"{archive.url}: rings: {path} is not there") from error
+    return (*built_in_rings(), parse_rings(data, f"{archive.url}/{path}"))
 
 
 def open_kernels(archive: Archive, configuration: Configuration, verify: bool = False) -> tuple[Kernel, ...]:

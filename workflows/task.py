@@ -278,7 +278,9 @@ class ImageRunner:
         if description.geometry == "spice" or (self._setup.kernels and block.spice is not None):
             camera = (block, label.mode)
             known = self._known_bodies
-            state = state_from_spice(label, ref.image_id, camera, description.settings, known, models)
+            state = state_from_spice(
+                label, ref.image_id, camera, description.settings, known, models, self._setup.rings
+            )
             return state, block, "spice"
         return state_from_header(raw, ref.image_id, block, description.settings), block, "header"
 

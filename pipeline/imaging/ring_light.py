@@ -1,0 +1,427 @@
+"""Loops over pixels of rings: light of a radial profile, pixels near edges, and the equations of blurred steps.
+
+A look through a pixel meets the ring plane at (X, Y); the signed distance to an edge, in pixels and positive outward,
+is ``(R - r(longitude)) / |gradient|`` with one more Newton step where it decides. A blurred step is the normal integral
+of that distance; on a curved edge the blur shifts it by ``sigma^2 / (2 radius of curvature)``.
+"""
+
+from math import atan2, erf, exp, floor, hypot, pi, sqrt
+
+import numba
+import numpy as np
+
+# Spacing of the grid of rays, see ``imaging/render.py``.
+_SPACING = 16.0
+# Edges of one unit.
+MOST_EDGES = 10
+_FAR_SIGMAS = 4.0
+_ROOT2, _ROOT2PI = sqrt(2.0), sqrt(2.0 * pi)
+# Residuals beyond so many sigmas are stars and struck pixels.
+_CLIP_SIGMAS, _LEAST_CLIP = 6.0, 0.7
+
+
+@numba.njit(cache=True, nogil=True)
+def look(slopes, origin, turn, observer, v, u, out):  # type: ignore[no-untyped-def]
+    """Point of the plane seen through a pixel and its derivatives: X, Y, dX/dv, dX/du, dY/dv, dY/du."""
+    y, x = (v - origin[0]) / _SPACING, (u - origin[1]) / _SPACING
+    i = min(max(floor(y), 0), slopes.shape[0] - 2)
+    j = min(max(floor(x), 0), slopes.shape[1] - 2)
+    y -= i
+    x -= j
+    d = 0.0
+    for k in range(3):
+        a, b = turn[k, 0], turn[k, 1]
+        p = a * slopes[i, j, 0] + b * slopes[i, j, 1]
+        q = a * slopes[i, j + 1, 0] + b * slopes[i, j + 1, 1]
+        r = a * slopes[i + 1, j, 0] + b * slopes[i + 1, j, 1]
+        s = a * slopes[i + 1, j + 1, 0] + b * slopes[i + 1, j + 1, 1]
+        out[6 + k] = (1 - y) * ((1 - x) * p + x * q) + y * ((1 - x) * r + x * s) + turn[k, 2]
+        out[9 + k] = ((1 - x) * (r - p) + x * (s - q)) / _SPACING
+        out[12 + k] = ((1 - y) * (q - p) + y * (s - r)) / _SPACING
+    d = out[8]
+    if d == 0.0 or not (-observer[2] / d > 0.0):
+        return False
+    share = -observer[2] / d
+    for k in range(2):
+        out[k] = observer[k] + share * out[6 + k]
+        out[2 + 2 * k] = share * (out[9 + k] - out[6 + k] / d * out[11])
+        out[3 + 2 * k] = share * (out[12 + k] - out[6 + k] / d * out[14])
+    return True
+
+
+@numba.njit(cache=True, nogil=True)
+def to_edge(curve, place, found):  # type: ignore[no-untyped-def]
+    """Signed distance in pixels, unit normal (v, u) outward, and km per pixel along it."""
+    x, y = place[0], place[1]
+    radius = hypot(x, y)
+    count = curve.shape[0]
+    at = atan2(y, x) / (2.0 * pi) * count
+    if at < 0:
+        at += count
+    i = int(at)
+    share = at - i
+    i = i % count
+    low, high = curve[i], curve[(i + 1) % count]
+    bend = (high - low) * count / (2.0 * pi)
+    gv = (x * place[2] + y * place[4]) / radius - bend * (x * place[4] - y * place[2]) / radius**2
+    gu = (x * place[3] + y * place[5]) / radius - bend * (x * place[5] - y * place[3]) / radius**2
+    length = hypot(gv, gu)
+    found[0] = (radius - (low + share * (high - low))) / length
+    found[1], found[2], found[3] = gv / length, gu / length, length
+
+
+@numba.njit(cache=True, nogil=True)
+def _normal_integral(z):  # type: ignore[no-untyped-def]
+    return 0.5 * (1.0 + erf(z / _ROOT2))
+
+
+@numba.njit(cache=True, nogil=True)
+def _covered(forms, place, observer, sun):  # type: ignore[no-untyped-def]
+    """0 free, 1 a body in the line of sight before the plane, 2 behind it, 3 in a body's shadow."""
+    state = 0
+    for k in range(forms.shape[0]):
+        f = forms[k]
+        for beam in range(2):
+            if beam == 0:
+                sx, sy, sz = observer[0] - f[0], observer[1] - f[1], observer[2] - f[2]
+                dx, dy, dz = place[0] - observer[0], place[1] - observer[1], -observer[2]
+            else:
+                if sun[0] == 0.0 and sun[1] == 0.0 and sun[2] == 0.0:
+                    continue
+                sx, sy, sz = place[0] - f[0], place[1] - f[1], -f[2]
+                dx, dy, dz = sun[0], sun[1], sun[2]
+            bx = f[3] * dx + f[4] * dy + f[5] * dz
+            by = f[6] * dx + f[7] * dy + f[8] * dz
+            bz = f[9] * dx + f[10] * dy + f[11] * dz
+            a = bx * dx + by * dy + bz * dz
+            b = bx * sx + by * sy + bz * sz
+            c = (
+                sx * (f[3] * sx + f[4] * sy + f[5] * sz)
+                + sy * (f[6] * sx + f[7] * sy + f[8] * sz)
+                + sz * (f[9] * sx + f[10] * sy + f[11] * sz)
+                - 1.0
+            )
+            root2 = b * b - a * c
+            if root2 < 0:
+                continue
+            far = (-b + sqrt(root2)) / a
+            near = (-b - sqrt(root2)) / a
+            if beam == 0 and near > 0:
+                if near < 1.0:
+                    return 1
+                state = 2
+            elif beam == 1 and far > 0 and state == 0:
+                state = 3
+    return state
+
+
+@numba.njit(cache=True, nogil=True)
+def profile_image(  # type: ignore[no-untyped-def]
+    slopes, origin, turn, observer, first, step, curves, means, spread, contrasts, sigma, forms, sun, out,
+):  # fmt: skip
+    """Light of the rings at pixels ``first + step * (i, j)``, blurred by ``sigma`` pixels across every edge."""
+    place, found = np.zeros(15), np.zeros(4)
+    for i in range(out.shape[0]):
+        for j in range(out.shape[1]):
+            out[i, j] = 0.0
+            if not look(slopes, origin, turn, observer, first[0] + step * i, first[1] + step * j, place):
+                continue
+            radius = hypot(place[0], place[1])
+            scale = hypot(
+                place[0] * place[2] + place[1] * place[4], place[0] * place[3] + place[1] * place[5]
+            ) / max(radius, 1e-9)
+            if forms.shape[0]:
+                hidden = _covered(forms, place, observer, sun)
+                if hidden == 1 or hidden == 3:
+                    continue
+            light = 0.0
+            reach = _FAR_SIGMAS * sigma * scale
+            for k in range(curves.shape[0]):
+                if radius > means[k] + spread[k] + reach:
+                    light += contrasts[k]
+                elif radius > means[k] - spread[k] - reach:
+                    to_edge(curves[k], place, found)
+                    light += contrasts[k] * _normal_integral(found[0] / sigma)
+            out[i, j] = light
+
+
+@numba.njit(cache=True, nogil=True)
+def near_edges(  # type: ignore[no-untyped-def]
+    slopes, origin, turn, observer, shape, curves, means, spread, reach, flat,
+):  # fmt: skip
+    """Flat indices of pixels within ``reach`` of an edge; how many. Far from all edges the walk takes long steps."""
+    place, found = np.zeros(15), np.zeros(4)
+    count = 0
+    for v in range(shape[0]):
+        u = 0
+        while u < shape[1]:
+            nearest = 64.0
+            if look(slopes, origin, turn, observer, float(v), float(u), place):
+                radius = hypot(place[0], place[1])
+                scale = hypot(
+                    place[0] * place[2] + place[1] * place[4], place[0] * place[3] + place[1] * place[5]
+                ) / max(radius, 1e-9)
+                for k in range(curves.shape[0]):
+                    gap = (abs(radius - means[k]) - spread[k]) / scale
+                    if gap < nearest:
+                        if spread[k] > 0.02 * scale:
+                            to_edge(curves[k], place, found)
+                            gap = abs(found[0])
+                        if gap < nearest:
+                            nearest = gap
+            if nearest <= reach and count < flat.shape[0]:
+                flat[count] = v * shape[1] + u
+                count += 1
+            u += max(1, int(0.4 * (nearest - reach)))
+    return count
+
+
+@numba.njit(cache=True, nogil=True)
+def measure(  # type: ignore[no-untyped-def]
+    slopes, origin, turn, observer, cols, flat, curves, cell_of, span, unit_of, unit_edges, reach, sigma, forms,
+    sun, unit, distance,
+):  # fmt: skip
+    """Unit of each pixel (-1 for none), and its distances in pixels to all edges of the unit."""
+    place, found, foot, other = np.zeros(15), np.zeros(4), np.zeros(15), np.zeros(4)
+    bins = cell_of.shape[0]
+    for n in range(flat.shape[0]):
+        unit[n] = -1
+        v, u = float(flat[n] // cols), float(flat[n] % cols)
+        if not look(slopes, origin, turn, observer, v, u, place):
+            continue
+        angle = atan2(place[1], place[0])
+        at = int((angle - span[0]) % (2.0 * pi) / span[1] * bins)
+        cell = cell_of[at] if at < bins else -1
+        if cell < 0:
+            continue
+        if forms.shape[0] and _covered(forms, place, observer, sun) > 0:
+            continue
+        best, nearest = -1, reach
+        for k in range(curves.shape[0]):
+            if unit_of[cell, k] >= 0:
+                to_edge(curves[k], place, found)
+                if abs(found[0]) < nearest:
+                    best, nearest = k, abs(found[0])
+        if best < 0:
+            continue
+        mine = unit_of[cell, best]
+        sound = True
+        for k in range(unit_edges[mine, 0], unit_edges[mine, 1]):
+            to_edge(curves[k], place, found)
+            s = found[0]
+            if abs(s) < 2.0 * reach:
+                bend = 0.0
+                if look(slopes, origin, turn, observer, v - s * found[1], u - s * found[2], foot):
+                    to_edge(curves[k], foot, other)
+                    s += other[0]
+                    nv, nu = other[1], other[2]
+                    # Curvature: how the normal turns along the edge.
+                    if look(
+                        slopes, origin, turn, observer,
+                        v - found[0] * found[1] - nu, u - found[0] * found[2] + nv, foot,
+                    ):  # fmt: skip
+                        to_edge(curves[k], foot, other)
+                        bend = -nu * (other[1] - nv) + nv * (other[2] - nu)
+                if abs(bend) * (sigma + abs(found[0])) > 0.5:
+                    sound = False
+                s += 0.5 * sigma * sigma * bend
+            distance[n, k - unit_edges[mine, 0]] = s
+        if sound:
+            unit[n] = mine
+
+
+@numba.njit(cache=True, nogil=True)
+def _eliminated(gram, pull, size, left, out_gram, out_pull):  # type: ignore[no-untyped-def]
+    """Schur complement on the parameters from ``left`` on."""
+    inner = np.linalg.solve(gram[:left, :left].copy(), np.ascontiguousarray(gram[:left, left:size]))
+    first = np.linalg.solve(gram[:left, :left].copy(), pull[:left].copy())
+    cross = np.ascontiguousarray(gram[left:size, :left])
+    rest = size - left
+    out_gram[:rest, :rest] = gram[left:size, left:size] - cross @ inner
+    out_pull[:rest] = pull[left:size] - cross @ first
+
+
+@numba.njit(cache=True, nogil=True)
+def unit_equations(  # type: ignore[no-untyped-def]
+    data, variance, distance, starts, edges, shifts, widening, sigma, relative, tied, amplitude, gram_out,
+    pull_out, fit_out,
+):  # fmt: skip
+    """Equations of every unit in its edges' shifts (px) and the blur's variance (px^2), brightness eliminated.
+
+    Brightness of a unit: level, slope, and one contrast per edge; with ``tied`` one scale for the ``relative`` ones.
+    ``fit_out`` gets chi-square, pixels, significance of the contrasts, and the contrasts.
+    """
+    most = MOST_EDGES + 3
+    width = sqrt(sigma * sigma + widening)
+    for n in range(edges.shape[0]):
+        low, high = starts[n], starts[n + 1]
+        count = edges[n, 1] - edges[n, 0]
+        steps = 1 if tied else count
+        left = 2 + steps
+        size = left + count + 1
+        gram_out[n] = 0.0
+        pull_out[n] = 0.0
+        fit_out[n] = 0.0
+        if high - low < 2 * left + 6:
+            continue
+        columns = np.zeros((high - low, most + most + MOST_EDGES))
+        for p in range(low, high):
+            row = columns[p - low]
+            row[0] = 1.0
+            row[1] = (distance[p, 0] - shifts[n, 0]) / 8.0
+            for k in range(count):
+                z = (distance[p, k] - shifts[n, k]) / width
+                value = _normal_integral(z)
+                if tied:
+                    row[2] += relative[edges[n, 0] + k] * value
+                else:
+                    row[2 + k] = value
+        keep = np.ones(high - low)
+        chosen = np.zeros(left)
+        chi2, used = 0.0, 0.0
+        for turn in range(2):
+            gram, pull = np.zeros((left, left)), np.zeros(left)
+            for p in range(low, high):
+                w = keep[p - low] / variance[p]
+                row = columns[p - low]
+                for a in range(left):
+                    pull[a] += w * row[a] * data[p]
+                    for b in range(a, left):
+                        gram[a, b] += w * row[a] * row[b]
+            for a in range(left):
+                for b in range(a):
+                    gram[a, b] = gram[b, a]
+                if a == 1:
+                    gram[a, a] += 1.0 / (0.2 * amplitude) ** 2
+                if a >= 2:
+                    gram[a, a] += 1.0 / (10.0 * amplitude) ** 2
+                gram[a, a] *= 1.0 + 1e-10
+            if gram[0, 0] <= 0:
+                break
+            chosen = np.linalg.solve(gram, pull)
+            chi2, used = 0.0, 0.0
+            for p in range(low, high):
+                expected = 0.0
+                for a in range(left):
+                    expected += chosen[a] * columns[p - low, a]
+                miss2 = (data[p] - expected) ** 2 / variance[p]
+                if keep[p - low] > 0:
+                    chi2 += miss2
+                    used += 1.0
+                columns[p - low, most] = data[p] - expected
+            if turn == 0:
+                excess = max(1.0, chi2 / max(used - left, 1.0))
+                dropped = False
+                tallest = 0.0
+                for a in range(2, left):
+                    tallest = max(tallest, abs(chosen[a]))
+                # The flank of a sharp edge misses a blurred step by up to half of it and is no outlier.
+                least = (_LEAST_CLIP * tallest) ** 2
+                for p in range(low, high):
+                    miss2 = columns[p - low, most] ** 2
+                    if miss2 > _CLIP_SIGMAS**2 * excess * variance[p] and miss2 > least:
+                        keep[p - low] = 0.0
+                        dropped = True
+                if not dropped:
+                    break
+        if used < 2 * left + 4:
+            continue
+        # Light that the steps explain over level and slope alone.
+        block, aside = np.zeros((left, left)), np.zeros(left)
+        _eliminated(gram, pull, left, 2, block, aside)
+        told = 0.0
+        for a in range(steps):
+            for b in range(steps):
+                told += chosen[2 + a] * block[a, b] * chosen[2 + b]
+        big, right = np.zeros((size, size)), np.zeros(size)
+        for p in range(low, high):
+            if keep[p - low] == 0.0:
+                continue
+            w = 1.0 / variance[p]
+            row = columns[p - low]
+            slot = most + 1
+            row[slot + count] = 0.0
+            for k in range(count):
+                z = (distance[p, k] - shifts[n, k]) / width
+                c = chosen[2] * relative[edges[n, 0] + k] if tied else chosen[2 + k]
+                steep = c * exp(-0.5 * z * z) / (_ROOT2PI * width)
+                row[slot + k] = -steep
+                row[slot + count] -= steep * z / (2.0 * width)
+            for a in range(size):
+                x = row[a] if a < left else row[slot + a - left]
+                if x == 0.0:
+                    continue
+                right[a] += w * x * row[most]
+                for b in range(a, size):
+                    y = row[b] if b < left else row[slot + b - left]
+                    big[a, b] += w * x * y
+        for a in range(size):
+            for b in range(a):
+                big[a, b] = big[b, a]
+            if a == 1:
+                big[a, a] += 1.0 / (0.2 * amplitude) ** 2
+            if 2 <= a < left:
+                big[a, a] += 1.0 / (10.0 * amplitude) ** 2
+            big[a, a] *= 1.0 + 1e-10
+        # Priors on brightness have done their part in the residuals already.
+        for a in range(left):
+            right[a] = 0.0
+        _eliminated(big, right, size, left, gram_out[n], pull_out[n])
+        fit_out[n, 0], fit_out[n, 1], fit_out[n, 2] = chi2, used, told
+        for a in range(steps):
+            fit_out[n, 3 + a] = chosen[2 + a]
+
+
+@numba.njit(cache=True, nogil=True)
+def band_equations(  # type: ignore[no-untyped-def]
+    slopes, origin, turn, observer, first, step, data, weight, curves, means, spread, sigma, forms, sun, gram,
+    pull,
+):  # fmt: skip
+    """Normal equations of an image in level, two slopes, and the brightness outside of every edge; data's power."""
+    place, found = np.zeros(15), np.zeros(4)
+    count = curves.shape[0]
+    share, which = np.zeros(count + 4), np.zeros(count + 4, np.int64)
+    rows, cols = data.shape
+    power = 0.0
+    for i in range(rows):
+        for j in range(cols):
+            w = weight[i, j]
+            if w <= 0.0:
+                continue
+            if not look(slopes, origin, turn, observer, first[0] + step * i, first[1] + step * j, place):
+                continue
+            if forms.shape[0] and _covered(forms, place, observer, sun) > 0:
+                continue
+            radius = hypot(place[0], place[1])
+            scale = hypot(
+                place[0] * place[2] + place[1] * place[4], place[0] * place[3] + place[1] * place[5]
+            ) / max(radius, 1e-9)
+            reach = _FAR_SIGMAS * sigma * scale
+            share[0], which[0] = 1.0, 0
+            share[1], which[1] = 2.0 * i / rows - 1.0, 1
+            share[2], which[2] = 2.0 * j / cols - 1.0, 2
+            filled = 3
+            before = 1.0
+            for k in range(count):
+                inside = 0.0
+                if radius > means[k] + spread[k] + reach:
+                    inside = 1.0
+                elif radius > means[k] - spread[k] - reach:
+                    to_edge(curves[k], place, found)
+                    inside = _normal_integral(found[0] / sigma)
+                # Band k - 1 lies between the edges k - 1 and k; what is inside of all of them is the level's.
+                if k > 0 and before - inside > 1e-6:
+                    share[filled], which[filled] = before - inside, 3 + k - 1
+                    filled += 1
+                before = inside
+                if inside < 1e-6:
+                    break
+            if count > 0 and before > 1e-6:
+                share[filled], which[filled] = before, 3 + count - 1
+                filled += 1
+            power += w * data[i, j] ** 2
+            for a in range(filled):
+                pull[which[a]] += w * share[a] * data[i, j]
+                for b in range(filled):
+                    gram[which[a], which[b]] += w * share[a] * share[b]
+    return power
