@@ -27,7 +27,7 @@ LEVELS = (
 )
 # Within a folder: modules that the others of it may import, lowest first. All others are equals.
 FOUNDATIONS = {
-    "geometry": ("rotations", "shape", "maplet"),
+    "geometry": ("rotations", "shape", "rays", "maplet"),
     "imaging": ("psf", "illumination", "render"),
     "pose": ("records", "se3", "normalise", "refine", "pnp", "ransac", "graph", "estimator", "triangulation"),
     "predict": ("bodies",),

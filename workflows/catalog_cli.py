@@ -1,4 +1,4 @@
-"""``pilotage catalog``: star tables of the user's, and what is known."""
+"""``pilotage catalog``: star tables of the user's, and what is known; maplets by the commands of ``maplet_cli``."""
 
 import hashlib
 import json
@@ -10,9 +10,13 @@ import typer
 from catalogs.star_sources import TableProblem, read_table
 from catalogs.stars import BUILT_IN_NAMES, added_index, build_index, cache_folder, is_catalog_name, open_index
 from pipeline.errors import ConfigurationError
+from workflows.maplet_cli import export_spc, import_spc, make_maplets
 from workflows.store import write_atomically
 
-app = typer.Typer(help="Star catalogues.", rich_markup_mode=None)
+app = typer.Typer(help="Star and maplet catalogues.", rich_markup_mode=None)
+app.command("import-spc")(import_spc)
+app.command("export-spc")(export_spc)
+app.command("make-maplets")(make_maplets)
 
 
 @app.command()
