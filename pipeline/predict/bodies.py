@@ -6,19 +6,16 @@ attitudes; :class:`BodyScene` keeps the few templates that techniques share.
 
 from dataclasses import dataclass, field, replace
 
+import cv2
 import numpy as np
 from pydantic import Field
 
-from pipeline.camera import project
-from pipeline.geometry.ellipsoid import intersect, limb_points, surface_normal
+from pipeline.geometry.ellipsoid import intersect
 from pipeline.geometry.pointing import corrected_attitude
-from pipeline.geometry.rotations import rotation_about
-from pipeline.imaging.illumination import law_of
-from pipeline.imaging.mesh import MeshSolid, render_meshes
+from pipeline.imaging.mesh import render_meshes
 from pipeline.imaging.render import (
     Cells,
     RayGrid,
-    Solid,
     Template,
     Window,
     blur,
@@ -28,10 +25,9 @@ from pipeline.imaging.render import (
     render_cells,
 )
 from pipeline.options import Options
+from pipeline.predict.body_view import BodyView, mesh_solid_of, solid_of, turned_view, view_body
 from pipeline.records import Body, CameraModel, FloatArray, Image, State
 
-_LIMB_SAMPLES = 96
-_AREA_SAMPLES = 32
 # Pixels of sky that a template keeps around a body, beyond the reach of the point spread.
 _SKY_PX = 6
 # Sky around everything that a search may look at.
@@ -39,6 +35,9 @@ _CANVAS_SKY_PX = 24
 # Templates are drawn at offsets on this grid (pixels, and pixels at half the array's diagonal for a rotation), so that
 # techniques that agree share one; what is left is small enough for a linear model.
 QUANTUM_PX = 0.125
+# Within so little the derivative of the bodies' turns is the same but for its place.
+_SAME_SPIN_PX = 3.0
+_SAME_SPIN_RAD = 0.035
 # Half the rotation between two renderings of which the difference is the derivative.
 SPIN_STEP_RAD = 0.01
 # A body whose lit area in the frame is below this share of the largest one's does not help to find it.
@@ -77,122 +76,21 @@ class BodyFate:
 
 
 @dataclass(frozen=True, eq=False)
-class BodyView:
-    """A body in the camera frame of one attitude.
+class _Spin:
+    """Derivative of an image with respect to the bodies' turns, and where they were when it was drawn."""
 
-    Attributes
-    ----------
-    body
-        The record.
-    centre_km
-        (3,) camera frame.
-    camera_from_body
-        (3, 3).
-    sun
-        (3,) camera frame.
-    centre_vu
-        (2,) pixel of the centre.
-    box
-        Pixels that it can touch.
-    diameter_px, phase_rad, px_per_km
-        Size; phase; scale at the body's distance.
-    """
+    places: dict[str, FloatArray]
+    rotation_rad: float
+    window: Window
+    image: Image
 
-    body: Body
-    centre_km: FloatArray
-    camera_from_body: FloatArray
-    sun: FloatArray
-    centre_vu: FloatArray
-    box: Window
-    diameter_px: float
-    phase_rad: float
-    px_per_km: float
-
-    def lit_area_px2(
-        self, camera: CameraModel, window: Window, others: "tuple[BodyView, ...]"
-    ) -> tuple[float, set[str]]:
-        """Lit area inside a window and not hidden by nearer bodies, and the names of those that hide some of it.
-
-        From a grid of rays; distortion, which hardly changes an area, is left out.
-        """
-        part = self.box.intersection(window)
-        if not part.pixels:
-            return 0.0, set()
-        v = part.v0 - 0.5 + part.rows * (np.arange(_AREA_SAMPLES) + 0.5) / _AREA_SAMPLES
-        u = part.u0 - 0.5 + part.cols * (np.arange(_AREA_SAMPLES) + 0.5) / _AREA_SAMPLES
-        uv = np.stack(np.meshgrid(u, v), axis=2).reshape(-1, 2) - camera.principal_point_vu[::-1]
-        slopes = uv @ np.linalg.inv(camera.k_px_per_mm).T / camera.focal_length_mm
-        rays = np.column_stack([slopes, np.ones(len(slopes))]) @ self.camera_from_body
-        points, hit = intersect(self.body.radii_km, self.observer_km, rays)
-        lit = np.zeros(len(rays), bool)
-        lit[hit] = surface_normal(self.body.radii_km, points[hit]) @ self.sun_from_body > 0
-        in_camera = rays @ self.camera_from_body.T
-        hiders = set()
-        for other in others:
-            if other is not self and np.linalg.norm(other.centre_km) < np.linalg.norm(self.centre_km):
-                hidden = intersect(other.body.radii_km, other.observer_km, in_camera @ other.camera_from_body)[1]
-                if (hidden & hit).any():
-                    hiders.add(other.body.name)
-                lit &= ~hidden
-        return float(np.count_nonzero(lit)) / _AREA_SAMPLES**2 * part.pixels, hiders
-
-    @property
-    def observer_km(self) -> FloatArray:
-        """(3,) the camera from the body's centre, body-fixed."""
-        return np.asarray(-self.camera_from_body.T @ self.centre_km)
-
-    @property
-    def sun_from_body(self) -> FloatArray:
-        """(3,) unit vector toward the Sun, body-fixed."""
-        return np.asarray(self.camera_from_body.T @ self.sun)
-
-    @property
-    def lit_px(self) -> float:
-        """Widest extent of the lit part across the terminator."""
-        return float(self.diameter_px * (1.0 + np.cos(self.phase_rad)) / 2.0)
-
-
-def view_body(body: Body, camera: CameraModel, camera_from_j2000: FloatArray) -> BodyView | str:
-    """Place a body in the camera frame.
-
-    Parameters
-    ----------
-    body
-        Body.
-    camera
-        Model.
-    camera_from_j2000
-        (3, 3) attitude.
-
-    Returns
-    -------
-    BodyView or str
-        Or the reason why there is none.
-    """
-    centre = camera_from_j2000 @ body.position_km
-    rotation = camera_from_j2000 @ body.body_from_j2000.T
-    distance = float(np.linalg.norm(centre))
-    observer = -rotation.T @ centre
-    if np.linalg.norm(observer / body.radii_km) <= 1.0:
-        return "around_camera"
-    if centre[2] <= 0 and distance > 2.0 * body.radii_km.max():
-        return "behind_camera"
-    sun = camera_from_j2000 @ body.sun_direction_j2000
-    phase = float(np.arccos(np.clip(-centre @ sun / distance, -1.0, 1.0)))
-    outline = limb_points(body.radii_km, observer, np.linspace(0, 2 * np.pi, _LIMB_SAMPLES, endpoint=False))
-    pixels, ahead = project(camera, outline @ rotation.T + centre)
-    middle = project(camera, centre[None])[0][0]
-    if not ahead.any() or not np.isfinite(middle).all():
-        return "behind_camera"
-    scale = float(camera.focal_length_mm * np.sqrt(abs(np.linalg.det(camera.k_px_per_mm))) / distance)
-    diameter = 2.0 * float(np.cbrt(np.prod(body.radii_km))) * scale
-    seen = pixels[ahead]
-    low, high = np.floor(seen.min(axis=0)) - 1, np.ceil(seen.max(axis=0)) + 2
-    if not ahead.all():
-        low, high = np.full(2, -1e6), np.full(2, 1e6)
-    low, high = np.clip(low, -1e6, 1e6), np.clip(high, -1e6, 1e6)
-    box = Window(int(low[0]), int(low[1]), int(high[0] - low[0]), int(high[1] - low[1]))
-    return BodyView(body, centre, rotation, sun, middle, box, diameter, phase, scale)
+    def carried(self, gap_vu: FloatArray, window: Window) -> Image:
+        """Moved by a part of a pixel or a few, into another window."""
+        down, right = gap_vu + np.array([self.window.v0 - window.v0, self.window.u0 - window.u0])
+        move = np.array([[1.0, 0.0, right], [0.0, 1.0, down]])
+        # A body cut by the border goes on beyond it.
+        moved = cv2.warpAffine(self.image, move, (window.cols, window.rows), borderMode=cv2.BORDER_REPLICATE)
+        return np.asarray(moved, np.float32)
 
 
 @dataclass(frozen=True, eq=False)
@@ -225,6 +123,7 @@ class BodyScene:
     canvas: Window
     rays: RayGrid | None
     _templates: dict[tuple[int, int, int], tuple[tuple[BodyView, ...], Template]] = field(default_factory=dict)
+    _spins: list[_Spin] = field(default_factory=list)
 
     def __len__(self) -> int:
         return len(self.views)
@@ -278,7 +177,8 @@ class BodyScene:
             # The blur carries light into the array from beyond its border.
             blur_px = min(int(np.ceil(4.0 * self.sigma_px)) + 1, _CANVAS_SKY_PX)
             wide = self.around(views, array.grown(blur_px, blur_px)) if window.pixels else window
-            self._templates[key] = views, self.render(views, wide).part(window)
+            drawn = self._with_spin(self._render(views, wide), views, rotation_rad)
+            self._templates[key] = views, drawn.part(window)
         return self._templates[key]
 
     def views_at(self, attitude: FloatArray) -> tuple[BodyView, ...]:
@@ -310,27 +210,57 @@ class BodyScene:
         Returns
         -------
         Template
-            Blurred, with derivatives.
+            Blurred, with derivatives; that of the bodies' own turn where a rotation is fitted.
         """
+        template = self._render(views, window)
+        turns = self.state.settings.fit_camera_rotation
+        return replace(template, spin=self._spin(views, window)) if turns else template
+
+    def picture(self, views: tuple[BodyView, ...], window: Window) -> Image:
+        """The image of :meth:`render` alone, without its derivatives."""
+        return blur_image(self._cells(views, window, *self._fineness(views)), window, self.sigma_px)
+
+    def _render(self, views: tuple[BodyView, ...], window: Window) -> Template:
+        """Image and its derivatives with respect to shift and width of the point spread."""
+        return blur(self._cells(views, window, *self._fineness(views)), window, self.sigma_px)
+
+    def _fineness(self, views: tuple[BodyView, ...]) -> tuple[int, int]:
+        """Cells along a pixel's side, and samples along that of a cell that no limb crosses."""
         largest = max((view.diameter_px for view in views), default=0.0)
         over = cells_per_pixel(self.sigma_px, largest)
         if any(view.body.mesh is not None for view in views):
             over = max(over, 2)
-        inner = 1 if largest > 60.0 else 2
-        template = blur(self._cells(views, window, over, inner), window, self.sigma_px)
-        if not self.state.settings.fit_camera_rotation:
+        return over, 1 if largest > 60.0 else 2
+
+    def _spin(self, views: tuple[BodyView, ...], window: Window) -> Image:
+        """Derivative with respect to a turn of every body about its own centre.
+
+        A difference of renderings: along a limb the gradient times a long lever would be all rounding.
+        """
+        more, less = (self.picture(self._spun(views, sign * SPIN_STEP_RAD), window) for sign in (1.0, -1.0))
+        return np.asarray((more - less) / np.float32(2.0 * SPIN_STEP_RAD))
+
+    def _with_spin(self, template: Template, views: tuple[BodyView, ...], rotation_rad: float) -> Template:
+        """Add the derivative of the turn: that of a pointing nearby, carried along, where there is one."""
+        if not self.state.settings.fit_camera_rotation or not views:
             return template
-        # A difference of renderings: along a limb the gradient times a long lever would be all rounding.
-        turned = [
-            blur_image(self._cells(self._spun(views, sign * SPIN_STEP_RAD), window, over, inner), window, self.sigma_px)
-            for sign in (1.0, -1.0)
-        ]
-        return replace(template, spin=(turned[0] - turned[1]) / np.float32(2.0 * SPIN_STEP_RAD))
+        places = {view.body.name: view.centre_vu for view in views}
+        lead = max(views, key=lambda view: view.diameter_px).body.name
+        for spin in self._spins:
+            if places.keys() != spin.places.keys() or abs(rotation_rad - spin.rotation_rad) > _SAME_SPIN_RAD:
+                continue
+            gap = places[lead] - spin.places[lead]
+            aside = [np.hypot(*(place - spin.places[name] - gap)) for name, place in places.items()]
+            if max(float(np.hypot(*gap)), *aside) < _SAME_SPIN_PX:
+                return replace(template, spin=spin.carried(gap, template.window))
+        drawn = self._spin(views, template.window)
+        self._spins.append(_Spin(places, rotation_rad, template.window, drawn))
+        return replace(template, spin=drawn)
 
     def _spun(self, views: tuple[BodyView, ...], theta: float) -> tuple[BodyView, ...]:
         """Bodies turned in the image, each about its own centre; +u goes toward +v."""
         angle = self.state.camera_model.handedness * theta
-        return tuple(_turned(view, angle) for view in views)
+        return tuple(turned_view(view, angle) for view in views)
 
     def render_coarse(self, window: Window) -> Image:
         """A-priori bodies in a window, one cell a pixel: good enough to find them by."""
@@ -344,9 +274,9 @@ class BodyScene:
             return cells
         for run, is_mesh in _runs(views):
             if is_mesh:
-                render_meshes(cells, [_mesh_solid(view, self.state.camera_model) for view in run], window)
+                render_meshes(cells, [mesh_solid_of(view, self.state.camera_model) for view in run], window)
             else:
-                solids = [_solid(view, self.state.bodies) for view in run]
+                solids = [solid_of(view, self.state.bodies) for view in run]
                 render_cells(cells, solids, self.rays, window, [view.box for view in run], inner)
         return cells
 
@@ -380,16 +310,11 @@ class BodyScene:
 
     def only(self, names: tuple[str, ...]) -> "BodyScene":
         """The scene with some of its bodies."""
-        return replace(self, views=tuple(v for v in self.views if v.body.name in names), _templates={})
+        return replace(self, views=tuple(v for v in self.views if v.body.name in names), _templates={}, _spins=[])
 
     def with_sigma(self, sigma_px: float) -> "BodyScene":
         """The same scene through another point spread."""
-        return replace(self, sigma_px=sigma_px, _templates={})
-
-
-def _turned(view: BodyView, angle_rad: float) -> BodyView:
-    turn = rotation_about(view.centre_km / np.linalg.norm(view.centre_km), angle_rad)
-    return replace(view, camera_from_body=turn @ view.camera_from_body, sun=turn @ view.sun)
+        return replace(self, sigma_px=sigma_px, _templates={}, _spins=[])
 
 
 def _runs(views: tuple[BodyView, ...]) -> list[tuple[list[BodyView], bool]]:
@@ -402,71 +327,6 @@ def _runs(views: tuple[BodyView, ...]) -> list[tuple[list[BodyView], bool]]:
         else:
             runs.append(([view], is_mesh))
     return runs
-
-
-def form_of(view: BodyView) -> FloatArray:
-    """(3, 3) B in the camera frame with ``x B x = 1`` on the surface.
-
-    Parameters
-    ----------
-    view
-        Body.
-
-    Returns
-    -------
-    numpy.ndarray
-        Per km^2.
-    """
-    rotation = view.camera_from_body
-    return np.asarray(rotation @ np.diag(1.0 / view.body.radii_km**2) @ rotation.T)
-
-
-def _solid(view: BodyView, bodies: tuple[Body, ...]) -> Solid:
-    """Body for the renderer, with whatever of the State may shade it, in the field or not."""
-    law, parameter = law_of(view.body.photometry, view.body.photometry_parameter, view.phase_rad)
-    shading = [
-        _occluder(other, view) for other in bodies if other.name != view.body.name and may_shade(other, view.body)
-    ]
-    occluders = np.array(shading).reshape(-1, 12)
-    return Solid(view.centre_km, form_of(view), view.sun, law, parameter, occluders)
-
-
-def may_shade(other: Body, body: Body) -> bool:
-    """Whether a body stands between another and the Sun, by their spheres.
-
-    Parameters
-    ----------
-    other
-        The one that may throw a shadow.
-    body
-        The one that it may fall upon.
-
-    Returns
-    -------
-    bool
-        Never of a body and itself.
-    """
-    gap = other.position_km - body.position_km
-    along = float(gap @ body.sun_direction_j2000)
-    aside = float(np.linalg.norm(gap - along * body.sun_direction_j2000))
-    return other is not body and along > 0 and aside < float(other.radii_km.max() + body.radii_km.max())
-
-
-def _occluder(other: Body, view: BodyView) -> FloatArray:
-    """(12,) centre and rows of the form of a shading body, in the frame of the body that it shades."""
-    camera_from_j2000 = view.camera_from_body @ view.body.body_from_j2000
-    rotation = camera_from_j2000 @ other.body_from_j2000.T
-    form = rotation @ np.diag(1.0 / other.radii_km**2) @ rotation.T
-    return np.concatenate([camera_from_j2000 @ other.position_km, form.ravel()])
-
-
-def _mesh_solid(view: BodyView, camera: CameraModel) -> MeshSolid:
-    mesh = view.body.mesh
-    assert mesh is not None
-    law, parameter = law_of(view.body.photometry, view.body.photometry_parameter, view.phase_rad)
-    points = mesh.vertices_km @ view.camera_from_body.T + view.centre_km
-    pixels, _ = project(camera, points)
-    return MeshSolid(points, pixels, mesh.facets, view.sun, law, parameter)
 
 
 def predict_bodies(state: State, sigma_px: float, options: BodyPredictionOptions) -> BodyScene:
@@ -490,18 +350,28 @@ def predict_bodies(state: State, sigma_px: float, options: BodyPredictionOptions
     reach = reach_px(state)
     array = Window(0, 0, rows, cols)
     canvas = array.grown(*reach)
-    views, fates = [], []
+    views, dark, fates = [], [], []
     for body in state.bodies:
         view = view_body(body, state.camera_model, state.attitude.camera_from_j2000)
         reason = view if isinstance(view, str) else _cull(view, canvas, options)
         fates.append(_fate(body, view, reason))
         if isinstance(view, BodyView) and not reason:
             views.append(view)
+        if isinstance(view, BodyView) and reason == "unlit":
+            dark.append(view)
+    views += [view for view in dark if _hides_any(view, views)]
     views, fates = _without_backgrounds(views, fates, state.camera_model, canvas)
     views.sort(key=lambda view: -float(np.linalg.norm(view.centre_km)))
     canvas = canvas.grown(_CANVAS_SKY_PX, _CANVAS_SKY_PX)
     rays = ray_grid(state.camera_model, canvas) if views else None
     return BodyScene(state, reach, sigma_px, tuple(views), tuple(fates), canvas, rays)
+
+
+def _hides_any(dark: BodyView, views: list[BodyView]) -> bool:
+    """Whether a body without light stands before another one, whose limb it would cut."""
+    distance = float(np.linalg.norm(dark.centre_km))
+    behind = [view for view in views if float(np.linalg.norm(view.centre_km)) > distance]
+    return any(dark.box.intersection(view.box).pixels for view in behind)
 
 
 def _without_backgrounds(

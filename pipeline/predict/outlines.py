@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from pipeline.camera import project
 from pipeline.geometry.ellipsoid import is_visible, limb_points, silhouette_form, surface_normal, terminator_points
 from pipeline.imaging.render import Template
-from pipeline.predict.bodies import BodyView
+from pipeline.predict.body_view import BodyView
 from pipeline.records import BoolArray, CameraModel, FloatArray, Record
 
 _FEWEST, _MOST = 48, 4000

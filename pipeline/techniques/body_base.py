@@ -8,7 +8,8 @@ from pipeline.frame import Frame
 from pipeline.geometry.pointing import move_pivot
 from pipeline.geometry.rotations import plane_rotation, plane_rotation_derivative
 from pipeline.imaging.render import Template, Window
-from pipeline.predict.bodies import BodyScene, BodyView
+from pipeline.predict.bodies import BodyScene
+from pipeline.predict.body_view import BodyView
 from pipeline.records import BoolArray, FloatArray, Image
 from pipeline.techniques.base import NavContext, TechniqueOptions, edge_flags
 

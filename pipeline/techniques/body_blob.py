@@ -26,7 +26,8 @@ from pipeline.techniques.base import (
     information_of,
 )
 from pipeline.techniques.body_base import Cutout, about, compose, cut_out, predicted_place, rough_levels
-from pipeline.techniques.model_errors import ModelErrorOptions, assumed_errors, correlated_sums
+from pipeline.techniques.model_errors import ModelErrorOptions, ModelErrors, assumed_errors, correlated_sums
+from pipeline.techniques.template_fit import TemplateFit
 
 NAME = "BodyBlobNav"
 _ROUNDS = 4
@@ -35,6 +36,8 @@ _SETTLED_PX = 0.02
 _LIT_SHARE = 0.05
 # A blob is told from others by size alone.
 _SURE = 0.99
+# Slope of the sky over half the cutout, relative to the brightness.
+_SKY_SLOPE_SHARE = 0.02
 
 
 class BodyBlobOptions(TechniqueOptions):
@@ -50,7 +53,7 @@ class BodyBlobOptions(TechniqueOptions):
 
 
 def body_blob_nav(
-    scene: BodyScene, frame: Frame, context: NavContext, options: BodyBlobOptions
+    scene: BodyScene, frame: Frame, fix: TemplateFit | None, context: NavContext, options: BodyBlobOptions
 ) -> TechniqueResult | TechniqueFailure:
     """Brightest blob within the margin, then its moment against the rendering's.
 
@@ -60,6 +63,8 @@ def body_blob_nav(
         Bodies; the largest is the one meant, and it must be small and alone.
     frame
         Image.
+    fix
+        A fit of the rendered body, from which its albedo and relief are taken where it agrees; never the place.
     context
         Camera, bounds.
     options
@@ -95,7 +100,7 @@ def body_blob_nav(
     assert moment is not None
     if _likeness(cutout) < options.min_likeness * _expected_likeness(cutout, frame, moment):
         return TechniqueFailure(NAME, StatusReason.NO_FEATURES_DETECTED, "the blob does not look like the body")
-    covariance = _covariance(cutout, frame, moment, options)
+    covariance = _covariance(cutout, frame, moment, _errors(cutout, fix, options))
     place = moment.middle + moment.shift
     return _result(offset, covariance, place, scene, context, confidence, options)
 
@@ -143,11 +148,10 @@ def _brightest(
     window = view.box.grown(4, 4)
     if window.intersection(scene.canvas) != window:
         return TechniqueFailure(NAME, StatusReason.NO_FEATURES_PREDICTED, "the body is predicted too far outside")
-    template = scene.render(scene.views, window)
-    image = template.image.astype(float)
+    image = scene.picture(scene.views, window).astype(float)
     tv, tu = np.indices(image.shape)
     predicted = np.array([(image * tv).sum(), (image * tu).sum()]) / max(float(image.sum()), 1e-30)
-    gap = centre - predicted - [template.window.v0, template.window.u0]
+    gap = centre - predicted - [window.v0, window.u0]
     return gap, _SURE
 
 
@@ -235,8 +239,17 @@ def _border(good: BoolArray) -> BoolArray:
     return np.asarray(edge & good)
 
 
-def _covariance(cutout: Cutout, frame: Frame, moment: _Moment, options: BodyBlobOptions) -> FloatArray:
-    """Covariance of the shift: noise of pixels and sky, and unknown albedo and relief."""
+def _errors(cutout: Cutout, fix: TemplateFit | None, options: BodyBlobOptions) -> ModelErrors:
+    """What the fit of the rendering at about the same place shows of the surface, else what is assumed of it."""
+    assumed = assumed_errors(cutout.primary, options.errors)
+    if fix is None:
+        return assumed
+    gap = float(np.hypot(*(fix.cutout.primary.centre_vu - cutout.primary.centre_vu)))
+    return fix.errors if gap < max(2.0, 0.25 * cutout.primary.diameter_px) else assumed
+
+
+def _covariance(cutout: Cutout, frame: Frame, moment: _Moment, errors: ModelErrors) -> FloatArray:
+    """Covariance of the shift: noise of pixels and sky, the sky's slope, and unknown albedo, slopes and relief."""
     template, support, lever = cutout.template, moment.support, moment.lever
     light = moment.scale * template.image[support].astype(float)
     photon = frame.noise.variance(moment.sky + light)
@@ -246,11 +259,18 @@ def _covariance(cutout: Cutout, frame: Frame, moment: _Moment, options: BodyBlob
     sky_variance = float(frame.noise.variance(np.array(moment.sky))) * np.pi / 2.0 / max(border, 1)
     pull = lever.sum(axis=0)
     covariance += sky_variance * np.outer(pull, pull)
-    errors = assumed_errors(cutout.primary, options.errors)
     v, u = (index.astype(float) for index in np.nonzero(support))
+    half = max(support.shape) / 2.0
+    for place in (v, u):
+        ramp = lever.T @ ((place - place.mean()) / half) * _SKY_SLOPE_SHARE * moment.scale
+        covariance += np.outer(ramp, ramp)
     slope = moment.scale * np.hypot(template.along_v, template.along_u)[support].astype(float)
     covariance += correlated_sums(lever, errors.texture * light, (v, u), errors.texture_px)
     covariance += correlated_sums(lever, errors.wide_texture * light, (v, u), errors.wide_texture_px)
+    for rms, reach in errors.patches:
+        covariance += correlated_sums(lever, rms * light, (v, u), reach)
+    lit = np.where(light > 0, errors.shading * moment.scale, 0.0)
+    covariance += correlated_sums(lever, lit, (v, u), errors.texture_px)
     covariance += correlated_sums(lever, errors.relief_px * slope, (v, u), errors.relief_reach_px)
     return np.asarray(covariance)
 

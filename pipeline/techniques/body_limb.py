@@ -8,7 +8,8 @@ from pydantic import Field
 from pipeline.frame import Frame
 from pipeline.geometry.rotations import plane_rotation
 from pipeline.imaging.edges import distance_to_edges, edge_field
-from pipeline.predict.bodies import BodyScene, BodyView
+from pipeline.predict.bodies import BodyScene
+from pipeline.predict.body_view import BodyView
 from pipeline.predict.outlines import limb_outline, terminator_outline
 from pipeline.records import FloatArray
 from pipeline.status import StatusReason

@@ -5,7 +5,8 @@ import numpy as np
 from pipeline.frame import Frame
 from pipeline.geometry.rotations import plane_rotation
 from pipeline.imaging.render import Window
-from pipeline.predict.bodies import BodyScene, BodyView
+from pipeline.predict.bodies import BodyScene
+from pipeline.predict.body_view import BodyView
 from pipeline.records import FloatArray
 from pipeline.techniques.base import NavContext
 from pipeline.techniques.body_base import compose
@@ -37,7 +38,7 @@ def find_rotation(scene: BodyScene, fit: TemplateFit, frame: Frame, context: Nav
     float or None
         Change of the rotation, radians; None where no rotation stands out.
     """
-    views, _ = scene.template(*scene.quantised(fit.offset_vu, fit.rotation_rad))
+    views = scene.views_at(scene.attitude(*scene.quantised(fit.offset_vu, fit.rotation_rad)))
     small = [view for view in views if view.body.name in scene.minor().names]
     stamped = [(view, stamp) for view in small if (stamp := _stamp(view, scene)) is not None]
     arms = [float(np.hypot(*(view.centre_vu - fit.pivot_vu))) for view, _ in stamped]
@@ -65,7 +66,7 @@ def _stamp(view: BodyView, scene: BodyScene) -> FloatArray | None:
     middle = np.rint(view.centre_vu).astype(int)
     window = Window(int(middle[0]) - half, int(middle[1]) - half, 2 * half + 1, 2 * half + 1)
     outside = window.intersection(scene.canvas) != window
-    return None if outside else np.asarray(scene.render((view,), window).image, float)
+    return None if outside else scene.picture((view,), window).astype(float)
 
 
 def _gain(view: BodyView, stamp: FloatArray, fit: TemplateFit, theta: float, frame: Frame) -> float:

@@ -246,7 +246,9 @@ def _judge(peaks: list[Peak], pyramid: _Pyramid, scene: BodyScene, context: NavC
     factor = pyramid.factors[-2] if len(pyramid.factors) > 1 else 1
     level = pyramid.level(factor)
     count = _independent(best, level, pyramid, factor)
-    apart = _SAME_PEAK * max(view.diameter_px for view in scene.views)
+    dark = {fate.name for fate in scene.fates if fate.reason}
+    sizes = [view.diameter_px for view in scene.views if view.body.name not in dark]
+    apart = _SAME_PEAK * max(sizes, default=0.0)
     rivals = [p for p in peaks[1:] if np.hypot(*np.subtract(p.offset_vu, best.offset_vu)) > max(apart, 2.0 * factor)]
     fit = _log_misfit(best.compared)
     # A limb is as sharp as the point spread, so nearly every pixel of the margin is a try of its own.

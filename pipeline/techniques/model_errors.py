@@ -13,7 +13,7 @@ import numpy as np
 from pydantic import Field
 
 from pipeline.options import Options
-from pipeline.predict.bodies import BodyView
+from pipeline.predict.body_view import BodyView
 from pipeline.records import BoolArray, FloatArray, Image
 
 # Correlated errors are summed on blocks of about a quarter of their reach.

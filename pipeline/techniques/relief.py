@@ -24,7 +24,7 @@ _LONG_FACTORS = np.array([0.0, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0])
 _LONG_REACH_DEG = 40.0
 # Factor on the expected relief from which a wrong shape is thought of.
 _ODD_FACTOR = 1.3
-# Long-wave error of a shape without a catalogue's figure, over its relief.
+# Long-wave error of a shape over its relief.
 _UNKNOWN_LONG = 1.0
 _SHORT_ARC_DEG = 100.0
 # A weight this small is an outlier's; it keeps the covariance finite.
@@ -211,25 +211,30 @@ def _likeliest(
     absent, present = np.log(1.0 - options.wrong_shape_chance), np.log(options.wrong_shape_chance)
     long_prior = np.where(_LONG_FACTORS > 0, present - np.log(len(_LONG_FACTORS) - 1), absent)
 
+    # A long-wave error is part of what is not known of a shape that nobody vouches for, and of any shape on a short
+    # arc, which cannot show it: over the catalogue's relief where there is one, else over what the outline shows.
+    known = all(f.known for f in fields.values())
+    least = 0.0 if known and span_deg > _SHORT_ARC_DEG else _UNKNOWN_LONG
+
+    def long_wave(f: float, g: float) -> float:
+        return max(g, least if known else least * f)
+
     def score(f: float, g: float) -> float:
-        return _restricted_likelihood(shift, design, base + f**2 * near + g**2 * far)
+        return _restricted_likelihood(shift, design, base + f**2 * near + long_wave(f, g) ** 2 * far)
 
     def best_short(g: float) -> tuple[float, float]:
         f = _climb(_FACTORS, start[0], lambda k: prior[k] + score(_FACTORS[k], g))
         k = int(np.argmin(np.abs(_FACTORS - f)))
         return float(prior[k]) + score(f, g), f
 
-    # A long-wave error is part of what is not known of a shape that nobody vouches for, and of any shape on a short
-    # arc, which cannot show it.
-    least = 0.0 if all(f.known for f in fields.values()) and span_deg > _SHORT_ARC_DEG else _UNKNOWN_LONG
-    plain = best_short(least)
-    if plain[1] <= _ODD_FACTOR and start[1] <= least:
-        return plain[1], least
+    plain = best_short(0.0)
+    if plain[1] <= _ODD_FACTOR and start[1] <= long_wave(plain[1], 0.0):
+        return plain[1], long_wave(plain[1], 0.0)
     # Reliefs far beyond what was expected: short waves and a wrong shape are weighed against each other.
     scored = [
-        (float(p) + s, f, max(float(g), least))
+        (float(p) + s, f, long_wave(f, float(g)))
         for g, p in zip(_LONG_FACTORS, long_prior, strict=True)
-        for s, f in [best_short(max(float(g), least))]
+        for s, f in [best_short(float(g))]
     ]
     _, short, long_ = max(scored)
     return short, long_

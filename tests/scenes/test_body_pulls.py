@@ -56,7 +56,7 @@ def _outcomes(rng: np.random.Generator) -> tuple[FloatArray, NavContext, list[Te
         body_disc_nav(fix, context, BodyDiscOptions()),
         body_limb_nav(fix.scene, frame, fix.fit, context, BodyLimbOptions()),
         body_terminator_nav(fix.scene, frame, fix.fit, 0.999, context, BodyTerminatorOptions()),
-        body_blob_nav(fix.scene, frame, context, BodyBlobOptions()),
+        body_blob_nav(fix.scene, frame, fix.fit, context, BodyBlobOptions()),
     ]  # fmt: skip
 
 

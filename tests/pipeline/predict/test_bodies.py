@@ -9,7 +9,8 @@ from numpy.testing import assert_allclose
 from pipeline.geometry.pointing import corrected_attitude
 from pipeline.geometry.rotations import rotation_about
 from pipeline.imaging.render import Template, Window, ray_grid
-from pipeline.predict.bodies import BodyPredictionOptions, BodyScene, form_of, predict_bodies, reach_px, view_body
+from pipeline.predict.bodies import BodyPredictionOptions, BodyScene, predict_bodies, reach_px
+from pipeline.predict.body_view import form_of, view_body
 from pipeline.records import Body, CameraModel, FloatArray, Image, Photometry
 from tests.scenes.body_scene import body_at, body_state, camera_of, corner_camera, seen, trace
 
@@ -192,6 +193,20 @@ def test_a_body_that_fills_the_frame_is_a_background_of_others_only() -> None:
     assert both.names == ("MOON",)
     assert {fate.name: fate.reason for fate in both.fates} == {"MOON": "", "WALL": "fills_frame"}
     assert _scene((wall,)).names == ("WALL",)
+
+
+def test_a_dark_body_is_drawn_where_it_hides_another_one() -> None:
+    night = body_at(PINHOLE, CENTRE, 8.0, 179.5, name="NIGHT", range_km=0.2e5)
+    moon = body_at(PINHOLE, CENTRE, 20.0, 20.0, name="MOON")
+    both = _scene((moon, night))
+    assert set(both.names) == {"MOON", "NIGHT"}
+    assert {fate.name: fate.reason for fate in both.fates} == {"MOON": "", "NIGHT": "unlit"}
+    lit, covered = _template(_scene((moon,))), _template(both)
+    part = covered.window.slices_in(lit.window)
+    middle = tuple(np.rint(np.array(CENTRE) - [covered.window.v0, covered.window.u0]).astype(int))
+    assert covered.image[middle] == 0.0 < lit.image[part][middle]
+    beside = body_at(PINHOLE, (CENTRE[0], CENTRE[1] + 60.0), 8.0, 179.5, name="NIGHT", range_km=0.2e5)
+    assert _scene((moon, beside)).names == ("MOON",)
 
 
 def test_figures_of_a_view() -> None:

@@ -8,7 +8,8 @@ from numpy.testing import assert_allclose
 
 from pipeline.geometry.rotations import rotation_about
 from pipeline.imaging.render import Window
-from pipeline.predict.bodies import BodyPredictionOptions, BodyView, predict_bodies
+from pipeline.predict.bodies import BodyPredictionOptions, predict_bodies
+from pipeline.predict.body_view import BodyView
 from pipeline.predict.outlines import Outline, limb_outline, terminator_outline
 from pipeline.records import Body, CameraModel, TriangleMesh
 from tests.scenes.body_scene import body_at, body_state, camera_of, corner_camera, trace

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from pipeline.predict.bodies import BodyView, view_body
+from pipeline.predict.body_view import BodyView, view_body
 from pipeline.records import FloatArray
 from pipeline.techniques.model_errors import (
     ModelErrorOptions,
