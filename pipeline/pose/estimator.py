@@ -174,6 +174,8 @@ class OpenCVGtsamPoseEstimator:
         usable = matches.plane.ok
         points, xy, covariance, _ = matches.take(usable)
         sigma = np.sqrt(np.trace(covariance, axis1=1, axis2=2) / 2.0)
+        if len(points) >= self.options.ransac.min_inliers:
+            refuse_degenerate(points, xy, float(np.median(sigma)))
         consensus = self._ransac.filter(points, xy, sigma)
         first = np.flatnonzero(usable)[consensus.inlier]
         start = np.zeros(len(usable), dtype=bool)

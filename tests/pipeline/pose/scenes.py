@@ -57,7 +57,7 @@ def plant(recipe: Recipe, seed: int) -> Planted:
     flat = rng.uniform(-1, 1, (recipe.count, 3)) * half * np.array([1, 1, 0 if recipe.planar else recipe.depth])
     tilt = Rotation.from_rotvec(np.radians(recipe.tilt_deg) * np.array([0.6, -0.8, 0.0]))
     pose = Pose(Rotation.random(rng=rng).as_matrix(), rng.normal(size=3) * 300.0)
-    points = (tilt.apply(flat) + [0, 0, recipe.range_km]) @ pose.camera_from_body + pose.position_km
+    points = (tilt.apply(flat) + np.array([0, 0, recipe.range_km])) @ pose.camera_from_body + pose.position_km
     pixels, _ = project(camera, pose.to_camera(points))
     covariance = _covariances(rng, recipe.count, 2) * recipe.sigma_px**2
     pixels = pixels + _draw(rng, covariance)

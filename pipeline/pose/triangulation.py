@@ -1,0 +1,276 @@
+"""Where straight lines of sight meet: a camera from many points, a point from many cameras (seed 004).
+
+Every line of sight says ``x cross C (p - r) = 0`` with x = K^-1 u on the ideal plane. ``linear`` solves that as it
+stands (Henry and Christian 2023, eq. 20); ``lost`` weights it by the covariance that the pixels' errors give it, which
+is optimal to first order (their eq. 30 ff.); ``midpoint`` makes every line count by its distance.
+"""
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+from pydantic import Field
+
+from pipeline.options import Options
+from pipeline.pose.normalise import to_plane
+from pipeline.pose.records import MatchError
+from pipeline.pose.se3 import SE3Utils
+from pipeline.records import BoolArray, CameraModel, FloatArray, Record
+
+# Least over largest eigenvalue of the normal matrix of unit rays: below it, lines are parallel to three microradians.
+_PARALLEL = 1e-11
+_LOST_ROUNDS = 2
+
+
+class TriangulationMethod(StrEnum):
+    """Weights of the lines of sight."""
+
+    LINEAR = "linear"
+    LOST = "lost"
+    MIDPOINT = "midpoint"
+
+
+class TriangulationOptions(Options):
+    """Settings of :class:`CameraTriangulation`."""
+
+    uncertaintyImageMeasurement: float = Field(
+        0.0, ge=0, description="1 sigma of a key point per axis, pixels; 0 means unknown: no covariance is made"
+    )
+    method: TriangulationMethod = Field(TriangulationMethod.LINEAR, description="weights of the lines of sight")
+
+
+@dataclass(frozen=True, eq=False)
+class CameraLocation(Record):
+    """A camera's position.
+
+    Attributes
+    ----------
+    position_km
+        (3,) in the frame of the points.
+    covariance_km2
+        (3, 3); None where the sigma of the pixels is unknown.
+    """
+
+    position_km: FloatArray
+    covariance_km2: FloatArray | None
+
+    def __post_init__(self) -> None:
+        self._freeze(position_km=(3,), covariance_km2=(3, 3))
+
+
+class CameraTriangulation:
+    """Position of a camera of known attitude from points of known place (seed 004).
+
+    Parameters
+    ----------
+    options
+        Method and uncertainty.
+    """
+
+    def __init__(self, options: TriangulationOptions | None = None) -> None:
+        self.options = options or TriangulationOptions()
+
+    def estimate(
+        self, points_km: FloatArray, pixels_vu: FloatArray, camera: CameraModel, camera_from_body: FloatArray
+    ) -> CameraLocation:
+        """Where the lines of sight from the points meet.
+
+        Parameters
+        ----------
+        points_km
+            (n, 3) point cloud.
+        pixels_vu
+            (n, 2) key points, in the same order.
+        camera
+            Model, with distortion.
+        camera_from_body
+            (3, 3) attitude, taken as exact.
+
+        Returns
+        -------
+        CameraLocation
+            Position, and its covariance where the uncertainty is known.
+
+        Raises
+        ------
+        MatchError
+            If lengths differ, a value is not finite, fewer than two points are given, the lines do not meet, or the
+            points come out behind the camera.
+        """
+        points, pixels = np.asarray(points_km, float), np.asarray(pixels_vu, float)
+        _check(points, pixels)
+        sigma = self.options.uncertaintyImageMeasurement
+        pixel_covariance = np.tile(np.eye(2) * (sigma or 1.0) ** 2, (len(points), 1, 1))
+        plane = to_plane(camera, pixels, pixel_covariance)
+        if not plane.ok.all():
+            raise MatchError(f"{int((~plane.ok).sum())} key points lie where the camera model has no inverse")
+        turns = np.broadcast_to(camera_from_body, (len(points), 3, 3))
+        one = np.zeros(len(points), dtype=np.int64)
+        # Seen from the camera's position the points are where the cameras are seen from a point: r and p change places.
+        lines = LinesOfSight(one, plane.xy, plane.covariance, turns, points)
+        found = intersect_lines(lines, 1, self.options.method, sign=-1.0)
+        if not found.ok[0]:
+            raise MatchError(_REFUSALS[int(found.refusal[0])])
+        return CameraLocation(found.places_km[0], found.covariance_km2[0] if sigma else None)
+
+
+_REFUSALS = ("", "fewer than two lines of sight", "the lines of sight are parallel", "points behind the camera")
+
+
+def _check(points: FloatArray, pixels: FloatArray) -> None:
+    if points.ndim != 2 or points.shape[1:] != (3,) or pixels.ndim != 2 or pixels.shape[1:] != (2,):
+        raise MatchError(f"points of shape {points.shape} and key points of shape {pixels.shape}")
+    if len(points) != len(pixels):
+        raise MatchError(f"{len(points)} points but {len(pixels)} key points")
+    if not (np.isfinite(points).all() and np.isfinite(pixels).all()):
+        raise MatchError("a point or a key point is not finite")
+    if len(points) < 2:
+        raise MatchError("two points at least are needed")
+
+
+@dataclass(frozen=True, eq=False)
+class LinesOfSight(Record):
+    """Lines of sight, each belonging to one unknown place.
+
+    Attributes
+    ----------
+    index
+        (n,) of the place.
+    xy
+        (n, 2) on the ideal plane of its camera.
+    covariance
+        (n, 2, 2) there.
+    camera_from_body
+        (n, 3, 3).
+    known_km
+        (n, 3) the known end: the camera, or the point.
+    """
+
+    index: FloatArray
+    xy: FloatArray
+    covariance: FloatArray
+    camera_from_body: FloatArray
+    known_km: FloatArray
+
+    def __post_init__(self) -> None:
+        n = len(self.index)
+        self._freeze(index=(n,), xy=(n, 2), covariance=(n, 2, 2), camera_from_body=(n, 3, 3), known_km=(n, 3))
+
+
+@dataclass(frozen=True, eq=False)
+class Intersections(Record):
+    """Places where lines meet.
+
+    Attributes
+    ----------
+    places_km
+        (m, 3), NaN where refused.
+    covariance_km2
+        (m, 3, 3), NaN where refused.
+    refusal
+        (m,) 0 good, 1 fewer than two lines, 2 parallel lines, 3 behind a camera.
+    """
+
+    places_km: FloatArray
+    covariance_km2: FloatArray
+    refusal: FloatArray
+
+    def __post_init__(self) -> None:
+        m = len(self.refusal)
+        self._freeze(places_km=(m, 3), covariance_km2=(m, 3, 3), refusal=(m,))
+
+    @property
+    def ok(self) -> BoolArray:
+        """(m,) True where lines meet."""
+        return np.asarray(self.refusal == 0)
+
+
+def _sums(index: FloatArray, values: FloatArray, count: int) -> FloatArray:
+    """Sums of (n, ...) values by index."""
+    flat = values.reshape(len(values), -1)
+    total = np.stack([np.bincount(index, flat[:, k], minlength=count) for k in range(flat.shape[1])], axis=1)
+    return np.asarray(total.reshape(count, *values.shape[1:]))
+
+
+def intersect_lines(
+    lines: LinesOfSight, count: int, method: TriangulationMethod = TriangulationMethod.LOST, sign: float = 1.0
+) -> Intersections:
+    """Places where lines of sight meet.
+
+    Parameters
+    ----------
+    lines
+        All lines of all places.
+    count
+        Places.
+    method
+        Weights.
+    sign
+        +1 where the unknown is seen, -1 where the unknown sees.
+
+    Returns
+    -------
+    Intersections
+        Places with the covariance that the pixels' errors give them, ranges taken from the solution (their A5).
+    """
+    ray = np.concatenate([lines.xy, np.ones((len(lines.xy), 1))], axis=1)
+    length = np.linalg.norm(ray, axis=1)
+    cross = SE3Utils.skew(ray)
+    rows = cross @ lines.camera_from_body
+    unit = rows / length[:, None, None]
+    refusal = _refuse(lines.index, unit, count)
+    if method is TriangulationMethod.MIDPOINT:
+        rows = unit
+    full = np.zeros((len(ray), 3, 3))
+    full[:, :2, :2] = lines.covariance
+    places = _solve(lines, rows, rows, refusal)
+    depth = _depth(lines, places, sign)
+    if method is TriangulationMethod.LOST:
+        # The first two rows of the cross product hold all three, and have a covariance that can be inverted.
+        two = rows[:, :2]
+        for _ in range(_LOST_ROUNDS):
+            noise = cross[:, :2] @ full @ cross[:, :2].transpose(0, 2, 1)
+            # A refused place may lie in the plane of a camera; it has to have some weight only.
+            squared = np.where((refusal[lines.index] == 0) & (depth != 0), depth, 1.0) ** 2
+            weighted = np.linalg.inv(noise * squared[:, None, None]) @ two
+            places = _solve(lines, two, weighted, refusal)
+            depth = _depth(lines, places, sign)
+        covariance = _inverse(_sums(lines.index, two.transpose(0, 2, 1) @ weighted, count), refusal)
+    else:
+        scale = depth / (length if method is TriangulationMethod.MIDPOINT else 1.0)
+        noise = cross @ full @ cross.transpose(0, 2, 1) * (scale**2)[:, None, None]
+        inverse = _inverse(_sums(lines.index, rows.transpose(0, 2, 1) @ rows, count), refusal)
+        covariance = inverse @ _sums(lines.index, rows.transpose(0, 2, 1) @ noise @ rows, count) @ inverse
+    behind = _sums(lines.index, (_depth(lines, places, sign) <= 0).astype(float), count) > 0
+    refusal = np.where((refusal == 0) & behind, 3, refusal)
+    places[refusal > 0], covariance[refusal > 0] = np.nan, np.nan
+    return Intersections(places, covariance, refusal)
+
+
+def _refuse(index: FloatArray, unit: FloatArray, count: int) -> FloatArray:
+    lines = np.bincount(index, minlength=count)
+    values = np.linalg.eigvalsh(_sums(index, unit.transpose(0, 2, 1) @ unit, count))
+    parallel = ~(values[:, 0] > _PARALLEL * values[:, 2])
+    return np.asarray(np.where(lines < 2, 1, np.where(parallel, 2, 0)))
+
+
+def _inverse(normal: FloatArray, refusal: FloatArray) -> FloatArray:
+    safe = np.where((refusal > 0)[:, None, None], np.eye(3), normal)
+    return np.asarray(np.linalg.inv(safe))
+
+
+def _solve(lines: LinesOfSight, rows: FloatArray, weighted: FloatArray, refusal: FloatArray) -> FloatArray:
+    count = len(refusal)
+    # Relative to the mean known end, so that places far from the origin lose no digits.
+    number = np.maximum(np.bincount(lines.index, minlength=count), 1)[:, None]
+    origin = _sums(lines.index, lines.known_km, count) / number
+    known = lines.known_km - origin[lines.index]
+    normal = _sums(lines.index, weighted.transpose(0, 2, 1) @ rows, count)
+    right = _sums(lines.index, (weighted.transpose(0, 2, 1) @ (rows @ known[:, :, None]))[:, :, 0], count)
+    return np.asarray(origin + (_inverse(normal, refusal) @ right[:, :, None])[:, :, 0])
+
+
+def _depth(lines: LinesOfSight, places: FloatArray, sign: float) -> FloatArray:
+    """(n,) distance along the optical axis."""
+    away = sign * (places[lines.index] - lines.known_km)
+    return np.asarray((lines.camera_from_body[:, 2] * away).sum(axis=1))
