@@ -41,7 +41,8 @@ def stars(
 @app.command()
 def flyby(
     directory: Annotated[Path, typer.Argument(help="New or empty folder.")],
-    frames: Annotated[int, typer.Option(min=1, help="Images to make.")] = 24,
+    frames: Annotated[int, typer.Option(min=0, help="Images of bodies to make.")] = 24,
+    ring_frames: Annotated[int, typer.Option(min=0, help="Images of rings to make.")] = 4,
     seed: Annotated[int, typer.Option(min=0, help="Same seed, same bytes.")] = 1,
     largest: Annotated[float, typer.Option(min=6.0, max=10000.0, help="Largest target, pixels across.")] = 3000.0,
     haze: Annotated[float, typer.Option(min=0.0, max=500.0, help="Scale height of the planet's air, km.")] = 0.0,
@@ -50,14 +51,15 @@ def flyby(
     smooth: Annotated[bool, typer.Option("--smooth", help="Smooth grey ellipsoids.")] = False,
     processes: Annotated[int, typer.Option(min=1, help="Processes that draw.")] = 2,
 ) -> None:
-    """A planet and its moons before Cassini-, Voyager- and LORRI-like cameras, with SPICE kernels."""
+    """Planets, moons and rings before Cassini-, Voyager- and LORRI-like cameras, with SPICE kernels."""
     default = FlybyOptions()
     options = FlybyOptions(
-        frames=frames, seed=seed, processes=processes, diameter_px=(default.diameter_px[0], largest), haze_km=haze,
-        star_share=stars, trap_share=1.0 if traps else default.trap_share, smooth=smooth,
+        frames=frames, ring_frames=ring_frames, seed=seed, processes=processes,
+        diameter_px=(default.diameter_px[0], largest), haze_km=haze, star_share=stars,
+        trap_share=1.0 if traps else default.trap_share, smooth=smooth,
     )  # fmt: skip
     try:
         path = make_flyby_sample(directory, options)
     except (ValueError, OSError) as error:
         raise ConfigurationError(f"{directory}: {error}") from error
-    typer.echo(f"{frames} images, kernels and truth.json in {path.parent}")
+    typer.echo(f"{frames + ring_frames} images, kernels and truth.json in {path.parent}")

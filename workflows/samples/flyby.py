@@ -15,17 +15,23 @@ import numpy as np
 import yaml
 
 from workflows.samples.flyby_expose import compose, take
-from workflows.samples.flyby_kernels import META_KERNEL, write_kernels
+from workflows.samples.flyby_kernels import META_KERNEL, bodies_of, write_kernels
 from workflows.samples.flyby_options import FlybyOptions
 from workflows.samples.flyby_plan import Shot, plan_shots
 from workflows.samples.flyby_products import write_product
-from workflows.samples.flyby_system import BODIES, PLANET_ID
+from workflows.samples.flyby_ring_plan import plan_ring_shots
+from workflows.samples.flyby_ring_system import ring_catalogue
+from workflows.samples.flyby_ring_truth import CONVENTION as RING_CONVENTION
+from workflows.samples.flyby_ring_truth import ring_truth_entry, told_features
+from workflows.samples.flyby_system import PLANET_ID, SampleBody
 from workflows.samples.flyby_terrain import terrain_of
 from workflows.samples.flyby_truth import CONVENTION, truth_entry
-from workflows.samples.write import Json
+from workflows.samples.write import Json, refuse_used
 
 CHUNK = 4
 """Frames a worker takes at a time."""
+RINGS = "rings.yaml"
+"""The ring catalogue, beside the description."""
 
 
 def write_shot(shot: Shot, folder: Path) -> Json:
@@ -36,13 +42,13 @@ def write_shot(shot: Shot, folder: Path) -> Json:
     write_product(shot, taken, folder)
     if shot.stars:
         scene.stars.to_parquet(folder / f"{shot.image_id}.stars.parquet", index=False)
-    return truth_entry(shot, scene, taken)
+    return truth_entry(shot, scene, taken) if scene.disc is None else ring_truth_entry(shot, scene, scene.disc, taken)
 
 
-def told_bodies(options: FlybyOptions) -> Json:
+def told_bodies(options: FlybyOptions, bodies: list[SampleBody]) -> Json:
     """Return what the archive tells of each body: its heights' rms (km) and correlation, scattering law and haze."""
     told: Json = {}
-    for body in BODIES:
+    for body in bodies:
         terrain = None if options.smooth else terrain_of(body, options.seed)
         block: Json = {
             "photometry": body.surface.law,
@@ -76,25 +82,30 @@ def make_flyby_sample(directory: Path, options: FlybyOptions) -> Path:
         If the directory holds anything, or is not a directory.
     """
     options.check()
-    if directory.exists() and (not directory.is_dir() or any(directory.iterdir())):
-        raise FileExistsError(f"{directory} is not an empty directory")
-    shots = plan_shots(options)
+    refuse_used(directory)
+    shots = plan_shots(options) + plan_ring_shots(options)
     for name in ("data", "kernels"):
         (directory / name).mkdir(parents=True)
     write_kernels(directory / "kernels", shots)
     entries = _write_shots(shots, directory / "data", options.processes)
-    truth = {"convention": CONVENTION, "frames": {s.image_id: e for s, e in zip(shots, entries, strict=True)}}
+    truth: Json = {"convention": CONVENTION, "frames": {s.image_id: e for s, e in zip(shots, entries, strict=True)}}
+    if options.ring_frames:
+        truth |= {"ring_convention": RING_CONVENTION, "rings": told_features(options.seed)}
+        text = yaml.safe_dump(ring_catalogue(), sort_keys=False)
+        (directory / RINGS).write_text(text, encoding="utf-8")
     (directory / "truth.json").write_text(json.dumps(truth, indent=1) + "\n", encoding="utf-8")
     # The description comes last: an archive without it was interrupted.
     globs = sorted({"data/*.fit" if shot.camera.stored == "lorri" else "data/*.IMG" for shot in shots})
-    description = {
+    description: Json = {
         "name": f"flyby-{options.seed}",
-        "images": globs,
+        "images": list(globs),
         "geometry": "spice",
         "kernels": f"kernels/{META_KERNEL}",
         "stars": "per-image" if any(shot.stars for shot in shots) else [],
-        "bodies": told_bodies(options),
+        "bodies": told_bodies(options, bodies_of(shots)),
     }
+    if options.ring_frames:
+        description["rings"] = RINGS
     path = directory / "archive.yaml"
     path.write_text(yaml.safe_dump(description, sort_keys=False), encoding="utf-8")
     return path

@@ -14,6 +14,9 @@ from workflows.samples.flyby_bodies import Scenery, centre_and_radius, prepare
 from workflows.samples.flyby_plan import Shot
 from workflows.samples.flyby_rays import HAZE_HEIGHTS, Spheres, approach
 from workflows.samples.flyby_render import BORDER_PX, Light, gather_light
+from workflows.samples.flyby_ring_rays import RingDisc
+from workflows.samples.flyby_ring_render import gather_ring_light
+from workflows.samples.flyby_ring_scene import prepare_rings
 from workflows.samples.flyby_system import PLANET_ID, Sighting
 from workflows.samples.flyby_terrain import lumpy, smooth_terrain, terrain_of
 from workflows.samples.photometry import Exposure
@@ -48,8 +51,10 @@ class Scene:
         (rows, columns) light of all sources and the background, without bias.
     shift_v, shift_u, scale
         (rows, columns) derivatives of it with respect to a shift by one pixel, and to the sources' brightness.
-    target_dn
-        Mean light of the target's lit disc before the optics.
+    factor
+        DN of a source of brightness one.
+    spheres, disc
+        The bodies, and the rings of a frame of rings, as the rays see them.
     stars
         Table of the field's stars, as seen.
     n_stars
@@ -62,7 +67,9 @@ class Scene:
     shift_v: FloatArray
     shift_u: FloatArray
     scale: FloatArray
-    target_dn: float
+    factor: float
+    spheres: Spheres
+    disc: RingDisc | None
     snr: float
     stars: pd.DataFrame
     n_stars: int
@@ -202,7 +209,11 @@ def compose(shot: Shot, rng: np.random.Generator) -> Scene:
     near = [s for s in sightings if s.body.name == shot.target or _is_near(shot, optics, s, told[s.body.name])]
     scenery = [_scenery(shot, sighting, rng) for sighting in near]
     spheres = prepare(shot.seen_with, shot.truth, scenery, sightings, shot.target)
-    light = gather_light(shot.seen_with, shot.camera.wings, spheres)
+    disc = None if shot.ring is None else prepare_rings(shot, shot.ring, rng)
+    if disc is None:
+        light = gather_light(shot.seen_with, shot.camera.wings, spheres)
+    else:
+        light = gather_ring_light(shot.seen_with, shot.camera.wings, spheres, disc)
     factor, mean = _level(shot, light, optics.background_dn)
     total = factor * light.total + (factor * _ghost(light.total, rng) if shot.kind == "ghost" else 0.0)
     background = _background(optics, STRAY_SHARE * factor * mean * rng.random(), rng)
@@ -215,7 +226,9 @@ def compose(shot: Shot, rng: np.random.Generator) -> Scene:
         shift_v=factor * light.shift_v + (moved[0] - moved[1]) / (2.0 * STEP_PX),
         shift_u=factor * light.shift_u + (moved[2] - moved[3]) / (2.0 * STEP_PX),
         scale=factor * light.total,
-        target_dn=factor * mean,
+        factor=factor,
+        spheres=spheres,
+        disc=disc,
         snr=float(factor * mean / np.sqrt(variance)),
         stars=table,
         n_stars=int(np.all((stars.vu > 0.0) & (stars.vu < np.array(optics.shape_vu) - 1.0), axis=1).sum()),

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from textwrap import dedent
 
@@ -16,8 +17,6 @@ from workflows.samples.flyby_cameras import SPACECRAFT, FlybyCamera, Spacecraft,
 from workflows.samples.flyby_plan import Shot, planet_relative
 from workflows.samples.flyby_system import (
     BODIES,
-    MOONS,
-    PLANET_ID,
     SUN_ID,
     SUN_RADIUS_KM,
     SampleBody,
@@ -126,7 +125,7 @@ def _mountings() -> list[tuple[str, int, FlybyCamera, FloatArray]]:
     return [*found, ("NH_LORRI_1X1", -98302, lorri, lorri.instrument_from_platform)]
 
 
-def frames_kernel() -> str:
+def frames_kernel(bodies: Sequence[SampleBody] = BODIES) -> str:
     """Return the text of the frames: platforms that C-kernels turn, cameras fixed in them, axes of the bodies."""
     entries: list[str] = []
     for craft in SPACECRAFT:
@@ -135,7 +134,7 @@ def frames_kernel() -> str:
     for name, number, camera, rotation in _mountings():
         entries.append(_frame(name, number, 4, number, camera.spacecraft.naif_id))
         entries.append(_fixed(number, camera.spacecraft.platform, rotation))
-    for body in BODIES:
+    for body in bodies:
         name = f"IAU_{body.name}"
         entries.append(_frame(name, MILLION + body.naif_id, 2, body.naif_id, body.naif_id))
         entries.append(f"OBJECT_{body.naif_id}_FRAME = '{name}'")
@@ -168,11 +167,11 @@ def camera_kernel() -> str:
     return _text_kernel("IK", "Cameras of the sample; pixel sizes in micrometres.", *entries)
 
 
-def bodies_kernel() -> str:
+def bodies_kernel(bodies: Sequence[SampleBody] = BODIES) -> str:
     """Return the text of the bodies' names, sizes and rotations."""
-    names = "\n".join(f"NAIF_BODY_NAME += ( '{b.name}' )\nNAIF_BODY_CODE += ( {b.naif_id} )" for b in BODIES)
+    names = "\n".join(f"NAIF_BODY_NAME += ( '{b.name}' )\nNAIF_BODY_CODE += ( {b.naif_id} )" for b in bodies)
     entries = [names, f"BODY{SUN_ID}_RADII = ( {SUN_RADIUS_KM} {SUN_RADIUS_KM} {SUN_RADIUS_KM} )"]
-    for body in BODIES:
+    for body in bodies:
         n = body.naif_id
         entries.append(f"""
             BODY{n}_RADII = ( {" ".join(_number(x) for x in body.radii_km)} )
@@ -218,28 +217,31 @@ def _write_orbit(handle: int, body: int, centre: int, state: State, span: tuple[
     )  # fmt: skip
 
 
+def bodies_of(shots: Sequence[Shot]) -> list[SampleBody]:
+    """Return the bodies that some frames know, planets before their moons."""
+    return list(dict.fromkeys(body for shot in shots for body in shot.bodies))
+
+
 def _span(shots: list[Shot]) -> tuple[float, float]:
     times = [shot.et for shot in shots]
     return min(times) - COVER_S, max(times) + COVER_S
 
 
 def write_bodies_spk(path: Path, groups: list[list[Shot]]) -> None:
-    """Write Sun, planet and moons around the frames of each spacecraft (groups)."""
+    """Write Sun, planets and moons around the frames of each spacecraft (groups)."""
     with _open_spk(path) as handle:
         for shots in groups:
             span = _span(shots)
             _write_orbit(handle, SUN_ID, BARYCENTRE_ID, sun_state, span, SLOW_STEP_S)
-            _write_orbit(handle, PLANET_ID, BARYCENTRE_ID, planet_state, span, SLOW_STEP_S)
-            for moon in MOONS:
-                step = 2.0 * np.pi / moon.motion_rad_s / NODES_PER_ORBIT
-                _write_orbit(handle, moon.naif_id, PLANET_ID, _orbit_of(moon), span, step)
-
-
-def _orbit_of(moon: SampleBody) -> State:
-    def state(et: float) -> tuple[FloatArray, FloatArray]:
-        return moon_state(moon, et)
-
-    return state
+            for body in bodies_of(shots):
+                planet = body.system.planet_id
+                if body.naif_id == planet:
+                    _write_orbit(
+                        handle, planet, BARYCENTRE_ID, partial(planet_state, system=body.system), span, SLOW_STEP_S
+                    )
+                    continue
+                step = 2.0 * np.pi / body.motion_rad_s / NODES_PER_ORBIT
+                _write_orbit(handle, body.naif_id, planet, partial(moon_state, body), span, step)
 
 
 def write_spacecraft_spk(path: Path, craft: Spacecraft, shots: list[Shot]) -> None:
@@ -250,8 +252,8 @@ def write_spacecraft_spk(path: Path, craft: Spacecraft, shots: list[Shot]) -> No
             epochs = shot.et + np.array([-PASS_S, 0.0, PASS_S])
             states = np.array([np.concatenate([place + velocity * (t - shot.et), velocity]) for t in epochs])
             spiceypy.spkw13(
-                handle, craft.naif_id, PLANET_ID, "J2000", float(epochs[0]), float(epochs[-1]), shot.image_id,
-                LINE_DEGREE, len(epochs), states, epochs,
+                handle, craft.naif_id, shot.bodies[0].naif_id, "J2000", float(epochs[0]), float(epochs[-1]),
+                shot.image_id, LINE_DEGREE, len(epochs), states, epochs,
             )  # fmt: skip
 
 
@@ -289,8 +291,9 @@ def write_kernels(folder: Path, shots: list[Shot]) -> None:
     shots
         Every frame of the archive.
     """
-    texts = {"sample.tls": leap_seconds_kernel(), "sample.tf": frames_kernel(), "sample.ti": camera_kernel()}
-    texts["sample.tpc"] = bodies_kernel()
+    bodies = bodies_of(shots)
+    texts = {"sample.tls": leap_seconds_kernel(), "sample.tf": frames_kernel(bodies), "sample.ti": camera_kernel()}
+    texts["sample.tpc"] = bodies_kernel(bodies)
     texts |= {f"{craft.short}.tsc": clock_kernel(craft.clock) for craft in SPACECRAFT}
     for name, text in texts.items():
         (folder / name).write_text(text, encoding="ascii")

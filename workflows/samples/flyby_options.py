@@ -17,8 +17,8 @@ class FlybyOptions:
 
     Attributes
     ----------
-    frames
-        Number of frames; cameras take turns.
+    frames, ring_frames
+        Number of frames of bodies and, after them, of rings; cameras take turns.
     seed
         Seed of everything random.
     cameras
@@ -39,7 +39,7 @@ class FlybyOptions:
     star_share
         Share of frames with stars, which have tables of their own.
     trap_share
-        Share of frames in which something told is wrong: a lumpy body, haze, a ghost, twins.
+        Share of frames in which something told is wrong: a lumpy body, haze, a ghost, twins, the radius of a ring.
     smooth
         Whether bodies are smooth grey ellipsoids, without relief and texture.
     scale_error
@@ -47,6 +47,7 @@ class FlybyOptions:
     """
 
     frames: int = 24
+    ring_frames: int = 0
     seed: int = 1
     cameras: tuple[str, ...] = (
         "cassini_nac", "voyager_na", "lorri_4x4", "cassini_nac_sum2", "voyager_na", "lorri_1x1", "cassini_nac",
@@ -69,7 +70,8 @@ class FlybyOptions:
         if not self.cameras or unknown:
             raise ValueError(f"cameras must be some of {', '.join(known)}; got {', '.join(unknown) or 'none'}")
         single: dict[str, tuple[float, float, float]] = {
-            "frames": (self.frames, 1, MAX_FRAMES),
+            "frames": (self.frames, 0 if self.ring_frames else 1, MAX_FRAMES),
+            "ring_frames": (self.ring_frames, 0, MAX_FRAMES),
             "seed": (self.seed, 0, 2**63 - 1),
             "processes": (self.processes, 1, MAX_PROCESSES),
             "max_rotation_deg": (self.max_rotation_deg, 0.0, 5.0),

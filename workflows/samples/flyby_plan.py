@@ -16,6 +16,7 @@ from workflows.samples.cameras import FloatArray, SampleCamera, unproject
 from workflows.samples.flyby_bodies import centre_and_radius, shades_of
 from workflows.samples.flyby_cameras import FlybyCamera, flyby_cameras
 from workflows.samples.flyby_options import TRAPS, FlybyOptions
+from workflows.samples.flyby_ring_system import RingScene
 from workflows.samples.flyby_system import (
     BODIES,
     MOONS,
@@ -81,6 +82,10 @@ class Shot:
         How often the brightest light fills the detector's scale; zero where the wanted signal decides.
     stars
         Whether there are stars.
+    bodies
+        Planet and moons that the spacecraft passes, the planet first.
+    ring
+        What is special about a frame of rings, None for one of bodies.
     """
 
     index: int
@@ -103,6 +108,8 @@ class Shot:
     haze_km: float
     smooth: bool
     scale_error: float
+    bodies: tuple[SampleBody, ...] = BODIES
+    ring: RingScene | None = None
 
     @property
     def seen_with(self) -> SampleCamera:
@@ -137,7 +144,7 @@ class Shot:
 
     def sightings(self) -> list[Sighting]:
         """Return every body as the spacecraft sees it."""
-        return [see(body, self.et, self.position_km, self.velocity_kms) for body in BODIES]
+        return [see(body, self.et, self.position_km, self.velocity_kms) for body in self.bodies]
 
 
 @dataclass(frozen=True)
@@ -373,6 +380,6 @@ def plan_shots(options: FlybyOptions) -> list[Shot]:
 
 
 def planet_relative(shot: Shot) -> tuple[FloatArray, FloatArray]:
-    """Return position (km) and velocity (km/s) of a shot's spacecraft from the planet."""
-    place, velocity = body_state(PLANET, shot.et)
+    """Return position (km) and velocity (km/s) of a shot's spacecraft from the planet that it passes."""
+    place, velocity = body_state(shot.bodies[0], shot.et)
     return shot.position_km - place, shot.velocity_kms - velocity

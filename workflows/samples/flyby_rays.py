@@ -272,7 +272,7 @@ def approach(s, k, x, y, z):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True)
-def _meet(s, k, x, y, z, angle, edge):  # type: ignore[no-untyped-def]
+def meet(s, k, x, y, z, angle, edge):  # type: ignore[no-untyped-def]
     """Direction from body k's centre of the point that a line of sight inside the silhouette meets, scaled axes."""
     ex, ey, ez = s.eye[k, 0], s.eye[k, 1], s.eye[k, 2]
     along = -(ex * x + ey * y + ez * z)
@@ -295,7 +295,7 @@ def _meet(s, k, x, y, z, angle, edge):  # type: ignore[no-untyped-def]
 def surface_light(s, k, x, y, z, angle, edge):  # type: ignore[no-untyped-def]
     """Light of body k's surface on a line of sight inside its silhouette, that of its smooth grey twin, and mu0."""
     x, y, z, inverse = -x, -y, -z, s.inverse_radii[k]
-    ux, uy, uz = _meet(s, k, -x, -y, -z, angle, edge)
+    ux, uy, uz = meet(s, k, -x, -y, -z, angle, edge)
     vx, vy, vz = x / inverse[0], y / inverse[1], z / inverse[2]
     length = np.sqrt(vx * vx + vy * vy + vz * vz)
     nx, ny, nz = _normal(inverse, ux, uy, uz)

@@ -166,7 +166,7 @@ def _smear(image, along_v, along_u):  # type: ignore[no-untyped-def]
     return out
 
 
-def _with_wings(image: FloatArray, wings: tuple[float, float]) -> FloatArray:
+def with_wings(image: FloatArray, wings: tuple[float, float]) -> FloatArray:
     """Return an image in which a share of all light is spread by a broad Gaussian."""
     share, sigma = wings
     rows, columns = (size + 128 if size > PERIOD - 128 else PERIOD // (1 if size > 512 else 2) for size in image.shape)
@@ -179,7 +179,7 @@ def _with_wings(image: FloatArray, wings: tuple[float, float]) -> FloatArray:
 
 
 @lru_cache(maxsize=8)
-def _directions(camera: SampleCamera) -> FloatArray:
+def directions(camera: SampleCamera) -> FloatArray:
     """Return (x/z, y/z) of the canvas's pixels and of one ring around it, (rows + 2, columns + 2, 2)."""
     sides = [np.arange(-BORDER_PX - 1.0, size + BORDER_PX + 1.0) for size in camera.shape_vu]
     pixels = np.stack(np.meshgrid(*sides, indexing="ij"), axis=-1)
@@ -203,7 +203,7 @@ def gather_light(camera: SampleCamera, wings: tuple[float, float], spheres: Sphe
     total, shift_v, shift_u, even, even_smooth = (np.zeros(canvas) for _ in range(5))
     own = np.zeros(camera.shape_vu)
     images = (total, shift_v, shift_u, even, even_smooth, own)
-    _gather(spheres, camera.shape_vu, _directions(camera), kernels, slopes, images)
+    _gather(spheres, camera.shape_vu, directions(camera), kernels, slopes, images)
     if even.any():
         (share,), (slope,) = core_kernels(camera.psf_sigma_px, 1)
         total += _smear(even, share, share)
@@ -211,4 +211,4 @@ def gather_light(camera: SampleCamera, wings: tuple[float, float], spheres: Sphe
         shift_u += _smear(even_smooth, share, slope)
     frame = tuple(slice(BORDER_PX, BORDER_PX + size) for size in camera.shape_vu)
     core = 1.0 - wings[0]
-    return Light(_with_wings(total, wings)[frame], core * shift_v[frame], core * shift_u[frame], own)
+    return Light(with_wings(total, wings)[frame], core * shift_v[frame], core * shift_u[frame], own)

@@ -1,4 +1,4 @@
-"""The invented planet of the flyby sample, its moons and their Sun: places, orientations and how they are seen.
+"""An invented planet of the flyby sample, its moons and their Sun: places, orientations and how they are seen.
 
 Everything is closed-form: Kepler orbits about a planet on a circle about the Sun, even rotation about fixed poles. The
 kernels of the sample are made from these functions, never read by them.
@@ -21,11 +21,34 @@ PLANET_ID = 1099
 SUN_GM_KM3_S2 = 1.32712440018e11
 """IAU 2015 nominal value, as in DE430."""
 SUN_RADIUS_KM = 695_700.0
-PLANET_GM_KM3_S2 = 6.8e6
-PLANET_DISTANCE_AU = 9.3
-POLE_DEG = (214.0, 52.0)
-"""Right ascension and declination of the planet's pole and the moons' common orbital plane."""
 DAY_S = 86_400.0
+
+
+@dataclass(frozen=True)
+class System:
+    """A planet's place among the others and what its moons share.
+
+    Attributes
+    ----------
+    planet_id
+        NAIF id.
+    gm_km3_s2
+        Of the planet.
+    distance_au, start_rad
+        Radius of its circle about the Sun, and its longitude at J2000.
+    pole_deg
+        (RA, Dec) of its pole and of the moons' common orbital plane.
+    """
+
+    planet_id: int
+    gm_km3_s2: float
+    distance_au: float
+    start_rad: float
+    pole_deg: tuple[float, float]
+
+
+POLE_DEG = (214.0, 52.0)
+SYSTEM = System(PLANET_ID, 6.8e6, 9.3, 1.3, POLE_DEG)
 
 
 @dataclass(frozen=True)
@@ -62,7 +85,7 @@ class SampleBody:
     Attributes
     ----------
     orbit_km, eccentricity, inclination_deg, anomaly_deg
-        Semi-major axis about the planet, and mean anomaly at J2000 counted from the node; the planet has none of them.
+        Semi-major axis about the planet, and mean anomaly at J2000 counted from the node; a planet has none of them.
     pole_deg, prime_deg, spin_deg_day
         Pole (RA, Dec) and prime meridian of J2000, and the rotation rate.
     """
@@ -78,6 +101,7 @@ class SampleBody:
     eccentricity: float = 0.0
     inclination_deg: float = 0.0
     anomaly_deg: float = 0.0
+    system: System = SYSTEM
 
     @property
     def mean_radius_km(self) -> float:
@@ -87,7 +111,7 @@ class SampleBody:
     @property
     def motion_rad_s(self) -> float:
         """Mean motion about the planet."""
-        return sqrt(PLANET_GM_KM3_S2 / self.orbit_km**3)
+        return sqrt(self.system.gm_km3_s2 / self.orbit_km**3)
 
 
 PLANET = SampleBody(
@@ -135,7 +159,7 @@ def body_named(name: str) -> SampleBody:
     return next(body for body in BODIES if body.name == name)
 
 
-def _equator_from_pole(pole_deg: tuple[float, float]) -> FloatArray:
+def equator_from_pole(pole_deg: tuple[float, float]) -> FloatArray:
     """Return the matrix whose columns are node, its normal and pole in J2000; the node is the pole's IAU node Q."""
     ra, dec = radians(pole_deg[0]), radians(pole_deg[1])
     pole = np.array([cos(dec) * cos(ra), cos(dec) * sin(ra), sin(dec)])
@@ -149,12 +173,12 @@ def sun_state(et: float) -> tuple[FloatArray, FloatArray]:
     return np.array([4.1e5, -3.3e5, 1.2e5]) + velocity * et, velocity
 
 
-def planet_state(et: float) -> tuple[FloatArray, FloatArray]:
-    """Return position (km) and velocity (km/s) of the planet from the barycentre, a circle about the Sun."""
+def planet_state(et: float, system: System = SYSTEM) -> tuple[FloatArray, FloatArray]:
+    """Return position (km) and velocity (km/s) of a planet from the barycentre, a circle about the Sun."""
     sun, sun_velocity = sun_state(et)
-    radius = PLANET_DISTANCE_AU * AU_KM
+    radius = system.distance_au * AU_KM
     rate = sqrt(SUN_GM_KM3_S2 / radius**3)
-    angle = 1.3 + rate * et
+    angle = system.start_rad + rate * et
     # The ecliptic, near enough: obliquity 23.44 deg.
     tilt = turn_about(np.array([1.0, 0.0, 0.0]), radians(23.44))
     out = tilt @ np.array([cos(angle), sin(angle), 0.0])
@@ -163,7 +187,7 @@ def planet_state(et: float) -> tuple[FloatArray, FloatArray]:
 
 
 def moon_state(moon: SampleBody, et: float) -> tuple[FloatArray, FloatArray]:
-    """Return position (km) and velocity (km/s) of a moon from the planet: Kepler's ellipse."""
+    """Return position (km) and velocity (km/s) of a moon from its planet: Kepler's ellipse."""
     e, motion = moon.eccentricity, moon.motion_rad_s
     mean = radians(moon.anomaly_deg) + motion * et
     anomaly = mean
@@ -171,7 +195,8 @@ def moon_state(moon: SampleBody, et: float) -> tuple[FloatArray, FloatArray]:
         anomaly = mean + e * sin(anomaly)
     flat = sqrt(1.0 - e * e)
     rate = motion / (1.0 - e * cos(anomaly))
-    plane = _equator_from_pole(POLE_DEG) @ turn_about(np.array([1.0, 0.0, 0.0]), radians(moon.inclination_deg))
+    tilt = turn_about(np.array([1.0, 0.0, 0.0]), radians(moon.inclination_deg))
+    plane = equator_from_pole(moon.system.pole_deg) @ tilt
     position = plane @ np.array([cos(anomaly) - e, flat * sin(anomaly), 0.0])
     velocity = plane @ np.array([-sin(anomaly), flat * cos(anomaly), 0.0])
     return moon.orbit_km * position, moon.orbit_km * rate * velocity
@@ -179,8 +204,8 @@ def moon_state(moon: SampleBody, et: float) -> tuple[FloatArray, FloatArray]:
 
 def body_state(body: SampleBody, et: float) -> tuple[FloatArray, FloatArray]:
     """Return position (km) and velocity (km/s) of planet or moon from the barycentre."""
-    position, velocity = planet_state(et)
-    if body.naif_id == PLANET_ID:
+    position, velocity = planet_state(et, body.system)
+    if body.naif_id == body.system.planet_id:
         return position, velocity
     from_planet, its_velocity = moon_state(body, et)
     return position + from_planet, velocity + its_velocity
@@ -189,7 +214,7 @@ def body_state(body: SampleBody, et: float) -> tuple[FloatArray, FloatArray]:
 def body_from_j2000(body: SampleBody, et: float) -> FloatArray:
     """Return the rotation (3, 3) to the body-fixed axes: the prime meridian W east of the node along the equator."""
     angle = radians(body.prime_deg) + (radians(body.spin_deg_day) / DAY_S * et) % (2.0 * pi)
-    turned: FloatArray = turn_about(np.array([0.0, 0.0, 1.0]), -angle) @ _equator_from_pole(body.pole_deg).T
+    turned: FloatArray = turn_about(np.array([0.0, 0.0, 1.0]), -angle) @ equator_from_pole(body.pole_deg).T
     return turned
 
 
@@ -241,5 +266,5 @@ def see(body: SampleBody, et: float, position_km: FloatArray, velocity_kms: Floa
         distance = float(np.linalg.norm(apart))
         then = et - distance / SPEED_OF_LIGHT_KMS
     seen = aberrate(apart[None] / distance, velocity_kms)[0]
-    sun = sun_state(then - PLANET_DISTANCE_AU * AU_KM / SPEED_OF_LIGHT_KMS)[0] - place
+    sun = sun_state(then - body.system.distance_au * AU_KM / SPEED_OF_LIGHT_KMS)[0] - place
     return Sighting(body, distance * seen, body_from_j2000(body, then), sun / np.linalg.norm(sun))

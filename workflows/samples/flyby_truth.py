@@ -81,7 +81,8 @@ def inside_share(centre: FloatArray, radius: float, shape_vu: tuple[int, int]) -
     return float(on.mean())
 
 
-def _rounded(values: FloatArray) -> list[JsonValue]:
+def rounded(values: FloatArray) -> list[JsonValue]:
+    """Return numbers rounded to four decimals, for JSON."""
     return [round(float(value), 4) for value in values]
 
 
@@ -93,7 +94,7 @@ def truth_entry(shot: Shot, scene: Scene, taken: Taken) -> Json:
     before = predicted_centre(shot, target)
     sigma_v, sigma_u, sigma_rotation = sigmas(shot, scene, taken)
     bodies: Json = {
-        name: {"centre_vu": _rounded(place), "diameter_px": round(diameter, 3)}
+        name: {"centre_vu": rounded(place), "diameter_px": round(diameter, 3)}
         for name, (place, diameter) in sorted(scene.bodies.items())
     }
     return {

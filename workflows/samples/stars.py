@@ -20,7 +20,7 @@ import yaml
 from workflows.samples.options import StarSampleOptions
 from workflows.samples.plan import FramePlan, plan_frames
 from workflows.samples.sky import read_real_sky
-from workflows.samples.write import FrameTruth, write_frame
+from workflows.samples.write import FrameTruth, refuse_used, write_frame
 
 __all__ = ["StarSampleOptions", "make_star_sample"]
 
@@ -55,8 +55,7 @@ def make_star_sample(directory: Path, options: StarSampleOptions) -> Path:
         If the directory holds anything, or is not a directory.
     """
     options.check()
-    if directory.exists() and (not directory.is_dir() or any(directory.iterdir())):
-        raise FileExistsError(f"{directory} is not an empty directory")
+    refuse_used(directory)
     plans, faint = plan_frames(options, read_real_sky())
     frames = directory / "frames"
     frames.mkdir(parents=True)

@@ -39,6 +39,12 @@ class FrameTruth:
     stars: TruthColumns
 
 
+def refuse_used(directory: Path) -> None:
+    """Raise FileExistsError unless a directory is empty or not there."""
+    if directory.exists() and (not directory.is_dir() or any(directory.iterdir())):
+        raise FileExistsError(f"{directory} is not an empty directory")
+
+
 def write_frame(plan: FramePlan, folder: Path) -> FrameTruth:
     """Render a planned frame and write it into a folder; returns its truth."""
     camera = plan.camera
