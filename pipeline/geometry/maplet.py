@@ -9,8 +9,9 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.camera import project
 from pipeline.errors import ContractError
-from pipeline.records import FloatArray, Record
+from pipeline.records import BoolArray, CameraModel, FloatArray, Record
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,6 +104,46 @@ class MapletIndex(Record):
     def concatenate(parts: "list[MapletIndex]") -> "MapletIndex":
         """All rows, in the order given."""
         return MapletIndex(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(MapletIndex)))
+
+
+@dataclass(frozen=True, eq=False)
+class MapletView(Record):
+    """A camera beside a body, in the body's own frame.
+
+    Attributes
+    ----------
+    camera
+        Model.
+    camera_from_body
+        (3, 3) rotation.
+    position_km
+        (3,) of the camera, body-fixed.
+    sun
+        (3,) unit vector from the body to the Sun, body-fixed.
+    """
+
+    camera: CameraModel
+    camera_from_body: FloatArray
+    position_km: FloatArray
+    sun: FloatArray
+
+    def __post_init__(self) -> None:
+        self._freeze(camera_from_body=(3, 3), position_km=(3,), sun=(3,))
+
+    def pixels(self, points_km: FloatArray) -> tuple[FloatArray, BoolArray]:
+        """Pixels of body-fixed points.
+
+        Parameters
+        ----------
+        points_km
+            (n, 3).
+
+        Returns
+        -------
+        tuple
+            (n, 2) pixels, not-a-number behind the camera; (n,) flags of what lies ahead.
+        """
+        return project(self.camera, (points_km - self.position_km) @ self.camera_from_body.T)
 
 
 def maplet_points_km(maplet: Maplet) -> FloatArray:
