@@ -143,6 +143,12 @@ def _undulation(d, low, high):  # type: ignore[no-untyped-def]
     return (b - a) / (high - low)
 
 
+@numba.njit(cache=True, inline="always")
+def _wrapped(angle):  # type: ignore[no-untyped-def]
+    """An angle between -3 pi and 3 pi brought to within pi of zero."""
+    return angle - 2.0 * np.pi if angle > np.pi else angle + 2.0 * np.pi if angle < -np.pi else angle
+
+
 @numba.njit(cache=True)
 def _texture(d, region, low, high, longitude):  # type: ignore[no-untyped-def]
     """Factors on optical depth and on brightness between two radii that no catalogue tells."""
@@ -161,23 +167,23 @@ def _texture(d, region, low, high, longitude):  # type: ignore[no-untyped-def]
             phase = d.waves[k, 1] * longitude + d.waves[k, 2] + 0.5 * out * number
             depth += damped * np.cos(phase) * np.exp(-((number * width) ** 2) / 24.0)
     for k in range(len(d.propellers)):
-        out = (radius - d.propellers[k, 0]) / np.sqrt(d.propellers[k, 2] ** 2 + width * width / 12.0)
-        turn = (longitude - d.propellers[k, 1] + np.pi) % (2.0 * np.pi) - np.pi
-        ahead = turn * radius / d.propellers[k, 3]
-        if abs(out) < 4.0 and abs(ahead) < 4.0:
+        out, size = radius - d.propellers[k, 0], d.propellers[k, 2]
+        if abs(out) < 4.0 * (size + width):
+            out /= np.sqrt(size * size + width * width / 12.0)
+            ahead = _wrapped(longitude - d.propellers[k, 1]) * radius / d.propellers[k, 3]
             # Two lobes: ahead on the inner side, behind on the outer one.
-            lobe = np.exp(-0.5 * ((out + 1.2) ** 2 + (ahead - 1.0) ** 2)) + np.exp(
-                -0.5 * ((out - 1.2) ** 2 + (ahead + 1.0) ** 2)
-            )
-            depth += d.propellers[k, 4] * lobe * d.propellers[k, 2] / max(d.propellers[k, 2], width)
+            lobe = np.exp(-0.5 * ((out + 1.2) ** 2 + (ahead - 1.0) ** 2))
+            lobe += np.exp(-0.5 * ((out - 1.2) ** 2 + (ahead + 1.0) ** 2))
+            depth += d.propellers[k, 4] * lobe * size / max(size, width)
     if d.broad[region] > 0.0:
         for k in range(len(d.spokes)):
-            if d.spokes[k, 0] < radius < d.spokes[k, 1]:
-                middle = 0.5 * (d.spokes[k, 0] + d.spokes[k, 1])
-                turn = longitude - d.spokes[k, 2] - d.spokes[k, 4] * (radius - middle)
-                turn = (turn + np.pi) % (2.0 * np.pi) - np.pi
-                near = (radius - d.spokes[k, 0]) * (d.spokes[k, 1] - radius) / (middle - d.spokes[k, 0]) ** 2
-                shade += d.spokes[k, 5] * near * near * np.exp(-0.5 * (turn / d.spokes[k, 3]) ** 2)
+            inner, outer = d.spokes[k, 0], d.spokes[k, 1]
+            if inner < radius < outer:
+                middle = 0.5 * (inner + outer)
+                turn = _wrapped(longitude - d.spokes[k, 2] - d.spokes[k, 4] * (radius - middle)) / d.spokes[k, 3]
+                if abs(turn) < 5.0:
+                    near = (radius - inner) * (outer - radius) / (middle - inner) ** 2
+                    shade += d.spokes[k, 5] * near * near * np.exp(-0.5 * turn * turn)
     return max(depth, 0.0), max(shade, 0.0)
 
 

@@ -18,6 +18,8 @@ from workflows.samples.flyby_rays import Spheres, approach, meet, surface_light
 from workflows.samples.flyby_render import BORDER_PX, EDGE_PX, Light, directions, with_wings
 from workflows.samples.flyby_ring_rays import (
     RingDisc,
+    edge_at,
+    first_edge,
     in_plane,
     lit_share,
     ring_light,
@@ -98,30 +100,31 @@ def bodies_near(s, v, u, x, y, z, near):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True)
-def radii_around(d, here, down, right):  # type: ignore[no-untyped-def]
-    """Radius at a pixel, its change (km) along v and u across the pixel, and the largest second difference.
+def radius_grid(d, across):  # type: ignore[no-untyped-def]
+    """Radius (rows, columns) at which each of some directions (x/z, y/z) meets the ring plane, -1 where it does not."""
+    radii = np.empty(across.shape[:2])
+    for i in range(radii.shape[0]):
+        for j in range(radii.shape[1]):
+            way, a, b, _ = in_plane(d, across[i, j, 0], across[i, j, 1], 1.0)
+            radii[i, j] = np.sqrt(a * a + b * b) if way > 0.0 else -1.0
+    return radii
 
-    The radius is negative where a line of sight near the pixel does not meet the plane.
+
+@numba.njit(cache=True, inline="always")
+def radius_slopes(radii, i, j):  # type: ignore[no-untyped-def]
+    """Change of the radius (km) along v and u across an element of a grid, and the largest second difference.
+
+    All are zero where a neighbour does not meet the plane.
     """
-    way, a, b, _ = in_plane(d, here[0], here[1], 1.0)
-    if way <= 0.0:
-        return -1.0, 0.0, 0.0, 0.0
-    radius, bend = np.sqrt(a * a + b * b), 0.0
-    slopes = (0.0, 0.0)
-    for axis in range(2):
-        step = down if axis == 0 else right
-        far, fx, fy, _ = in_plane(d, here[0] + 0.5 * step[0], here[1] + 0.5 * step[1], 1.0)
-        back, bx, by, _ = in_plane(d, here[0] - 0.5 * step[0], here[1] - 0.5 * step[1], 1.0)
-        if far <= 0.0 or back <= 0.0:
-            return -1.0, 0.0, 0.0, 0.0
-        after, before = np.sqrt(fx * fx + fy * fy), np.sqrt(bx * bx + by * by)
-        bend = max(bend, 4.0 * abs(after - 2.0 * radius + before))
-        slopes = (after - before, slopes[1]) if axis == 0 else (slopes[0], after - before)
-    return radius, slopes[0], slopes[1], bend
+    here, up, down, left, right = radii[i, j], radii[i - 1, j], radii[i + 1, j], radii[i, j - 1], radii[i, j + 1]
+    if min(here, up, down, left, right) < 0.0:
+        return 0.0, 0.0, 0.0
+    bend = max(abs(up - 2.0 * here + down), abs(left - 2.0 * here + right))
+    return 0.5 * (down - up), 0.5 * (right - left), bend
 
 
 @numba.njit(cache=True)
-def _sample(s, d, near, planet, x, y, width, reached, body):  # type: ignore[no-untyped-def]
+def _sample(d, x, y, width, reached, body):  # type: ignore[no-untyped-def]
     """Light of one line of sight, without texture, and of the rings alone; body is what it meets behind the rings."""
     distance, rough, smooth = body
     if not reached:
@@ -136,27 +139,43 @@ def _sample(s, d, near, planet, x, y, width, reached, body):  # type: ignore[no-
 
 
 @numba.njit(cache=True)
-def gather_cells(s, d, planet, across, cells):  # type: ignore[no-untyped-def]
+def _is_even(d, here, radius, reach):  # type: ignore[no-untyped-def]
+    """Whether neither an edge nor the shadow's rim comes nearer to a pixel than a stretch of radii."""
+    _, a, b, _ = in_plane(d, here[0], here[1], 1.0)
+    longitude = turned_longitude(a, b)
+    k = first_edge(d, longitude, radius - reach)
+    if k < d.edges.shape[1] and edge_at(d, longitude, k) < radius + reach:
+        return False
+    sun = lit_share(d, a, b, 2.0 * reach)
+    return sun <= 0.0 or sun >= 1.0
+
+
+@numba.njit(cache=True)
+def gather_cells(s, d, planet, across, radii, cells):  # type: ignore[no-untyped-def]
     """Sample every pixel of the canvas into its four cells.
 
-    across holds the directions (x/z, y/z) of the canvas's pixels and of one more around it, (rows + 2, columns + 2, 2).
+    across holds the directions (x/z, y/z) of the canvas's pixels and of one more around it, (rows + 2, columns + 2, 2),
+    and radii where they meet the ring plane.
     """
     near = np.zeros(len(s.law), np.bool_)
     inner, outer = d.edges[:, 0].min(), d.edges[:, -1].max()
     for row in range(cells.rings.shape[0]):
         for column in range(cells.rings.shape[1]):
-            here = across[row + 1, column + 1]
-            down = 0.5 * (across[row + 2, column + 1] - across[row, column + 1])
-            right = 0.5 * (across[row + 1, column + 2] - across[row + 1, column])
+            here, radius = across[row + 1, column + 1], radii[row + 1, column + 1]
             met, limb = bodies_near(s, row - BORDER_PX, column - BORDER_PX, here[0], here[1], 1.0, near)
-            radius, slope_v, slope_u, bend = radii_around(d, here, down, right)
-            slope = max(np.sqrt(slope_v**2 + slope_u**2), 1e-9)
+            slope_v, slope_u, bend = radius_slopes(radii, row + 1, column + 1)
+            slope = max(np.sqrt(slope_v * slope_v + slope_u * slope_u), 1e-9)
             reach = slope + 0.5 * bend
             reached = radius > 0.0 and inner - reach < radius < outer + reach
             if not (met or reached):
                 continue
-            bent = bend / slope if reached else 0.0
-            n = 8 if limb or bent > VERY_BENT else 4 if bent > BENT else 2
+            n = 8
+            if not limb:
+                n = 2 if bend < BENT * slope else 4 if bend < VERY_BENT * slope else 8
+                if not reached or _is_even(d, here, radius, 0.6 * slope + 0.5 * bend):
+                    n = 1
+            down = 0.5 * (across[row + 2, column + 1] - across[row, column + 1])
+            right = 0.5 * (across[row + 1, column + 2] - across[row + 1, column])
             body = (-1.0, 0.0, 0.0)
             if met and not limb:
                 body = body_at(s, d, near, planet, here[0], here[1], 1.0, slope)
@@ -165,13 +184,16 @@ def gather_cells(s, d, planet, across, cells):  # type: ignore[no-untyped-def]
                     pv, pu = (i + 0.5) / n - 0.5, (j + 0.5) / n - 0.5
                     x = here[0] + pv * down[0] + pu * right[0]
                     y = here[1] + pv * down[1] + pu * right[1]
-                    if met and limb:
+                    if limb:
                         body = body_at(s, d, near, planet, x, y, 1.0, slope)
-                    light, plain, own = _sample(s, d, near, planet, x, y, slope / n, reached, body)
-                    a, b, part = 2 * i // n, 2 * j // n, 4.0 / (n * n)
-                    cells.rough[a, b, row, column] += part * light
-                    cells.plain[a, b, row, column] += part * plain
-                    cells.rings[row, column] += 0.25 * part * own
+                    light, plain, own = _sample(d, x, y, slope / n, reached, body)
+                    cells.rings[row, column] += own / (n * n)
+                    if n == 1:
+                        cells.rough[:, :, row, column] = light
+                        cells.plain[:, :, row, column] = plain
+                    else:
+                        cells.rough[2 * i // n, 2 * j // n, row, column] += 4.0 / (n * n) * light
+                        cells.plain[2 * i // n, 2 * j // n, row, column] += 4.0 / (n * n) * plain
 
 
 @numba.njit(cache=True)
@@ -219,7 +241,8 @@ def gather_ring_light(camera: SampleCamera, wings: tuple[float, float], spheres:
     """
     canvas = (camera.shape_vu[0] + 2 * BORDER_PX, camera.shape_vu[1] + 2 * BORDER_PX)
     cells = Cells(np.zeros((2, 2, *canvas)), np.zeros((2, 2, *canvas)), np.zeros(canvas))
-    gather_cells(spheres, disc, spheres.target, directions(camera), cells)
+    across = directions(camera)
+    gather_cells(spheres, disc, spheres.target, across, radius_grid(disc, across), cells)
     share, slope = cell_kernels(camera.psf_sigma_px)
     total = _spread_along_v(_spread_along_u(cells.rough, share), share)
     plain_u = _spread_along_u(cells.plain, share)

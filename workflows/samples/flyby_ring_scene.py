@@ -110,7 +110,7 @@ def _spokes(aim_rad: float, phase_rad: float, rng: np.random.Generator) -> Float
     count = int(rng.integers(0, 9))
     inner = rng.uniform(SPOKES_KM[0], SPOKES_KM[1] - 5000.0, count)
     outer = inner + rng.uniform(2000.0, 5000.0, count)
-    longitude = aim_rad + rng.normal(0.0, 0.5, count)
+    longitude = (aim_rad + rng.normal(0.0, 0.5, count)) % (2.0 * np.pi)
     strength = rng.uniform(0.05, 0.2, count) * (1.0 if phase_rad > np.radians(60.0) else -1.0)
     width, shear = rng.uniform(0.004, 0.03, count), rng.uniform(-1.0, 1.0, count) * 1.5e-5
     return np.stack([inner, outer, longitude, width, shear, strength], axis=1)
@@ -123,7 +123,7 @@ def _propellers(aim_rad: float, rng: np.random.Generator) -> FloatArray:
     return np.stack(
         [
             rng.uniform(64_500.0, 66_300.0, count),
-            aim_rad + rng.normal(0.0, spread, count),
+            (aim_rad + rng.normal(0.0, spread, count)) % (2.0 * np.pi),
             rng.uniform(0.8, 3.0, count),
             rng.uniform(15.0, 150.0, count),
             rng.uniform(-0.7, 0.7, count),

@@ -22,7 +22,7 @@ from workflows.samples.flyby_ring_rays import (
     scattered,
     turned_longitude,
 )
-from workflows.samples.flyby_ring_render import radii_around
+from workflows.samples.flyby_ring_render import radius_grid, radius_slopes
 from workflows.samples.flyby_ring_scene import plane_from_j2000, sorted_edges
 from workflows.samples.flyby_ring_system import FEATURES
 from workflows.samples.flyby_system import see
@@ -35,12 +35,12 @@ CONVENTION = (
     "kind ring: cramer_rao_*: of the whole scene without texture, rings_alone: of the rings' edges without bodies; "
     "both with an unknown radius of every feature within its sigma_a_km, an unknown brightness and background, and, "
     "where a rotation is fitted, its prior. observable_dv, observable_du: unit vector of the direction that is known "
-    "best, whose sigma is *_along_px, the other direction's *_across_px; observable_directions: how many of them are below "
-    "0.5 px; null: nothing is known. n_edges: edges whose own place could be found to 0.25 px; features: true a_km of "
-    "theirs, that of a moved one included. opening_deg: from the ring plane to the spacecraft, opening_sun_deg: to the "
-    "Sun, both positive to the north. kind ring_radius_trap: moved_feature lies moved_km beyond its own error"
+    "best, whose sigma is *_along_px, the other direction's *_across_px; observable_directions: how many of them are "
+    "below 0.5 px; null: nothing is known. n_edges: edges whose own place could be found to 0.25 px; features: true "
+    "a_km of theirs, that of a moved one included. opening_deg: from the ring plane to the spacecraft, "
+    "opening_sun_deg: to the Sun, both positive to the north. kind ring_radius_trap: moved_feature lies moved_km beyond its own error"
 )
-WHOLE, RINGS = (0, 1, 2), (3, 4, 5)
+WHOLE, RINGS, WHOLE_AND_LEVELS = (0, 1, 2), (3, 4, 5), (0, 1, 2, 6, 7)
 REACH_SIGMA = 4.0
 SEEN_PX = 0.25
 """An edge counts as seen if its own place along its normal could be found to this."""
@@ -67,16 +67,12 @@ def _hidden(spheres, way, x, y):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True)
-def edge_slopes(s, d, here, down, right, sigma_px, factor, index, value):  # type: ignore[no-untyped-def]
-    """Derivatives (DN per km) of a pixel's light with respect to the radii of the edges near, and the gradients.
+def edge_slopes(s, d, here, radius, slope, sigma_px, factor, index, value):  # type: ignore[no-untyped-def]
+    """Derivatives (DN per km) of a pixel's light with respect to the radii of the edges near.
 
-    Edges' indices and derivatives are left in two arrays (MOST,); returns how many there are and the change of the
-    radius along v and u, km per pixel.
+    Edges' indices and derivatives are left in two arrays (MOST,); returns how many there are. slope is the change of
+    the radius, km per pixel.
     """
-    radius, slope_v, slope_u, _ = radii_around(d, here, down, right)
-    slope = np.sqrt(slope_v * slope_v + slope_u * slope_u)
-    if radius <= 0.0 or slope <= 0.0:
-        return 0, 0.0, 0.0
     way, a, b, mu = in_plane(d, here[0], here[1], 1.0)
     longitude, reach = turned_longitude(a, b), REACH_SIGMA * sigma_px * slope
     k, found = first_edge(d, longitude, radius - reach), 0
@@ -94,43 +90,46 @@ def edge_slopes(s, d, here, down, right, sigma_px, factor, index, value):  # typ
     if found:
         light = 0.0 if _hidden(s, way, here[0], here[1]) else lit_share(d, a, b, slope)
         value[:found] *= light
-    return found, slope_v, slope_u
+    return found
 
 
 @numba.njit(cache=True)
-def gather_information(s, d, across, columns, weight, owner, sigma_px, factor, middle, features):  # type: ignore[no-untyped-def]
+def gather_information(s, d, across, radii, columns, weight, owner, sigma_px, factor, middle, features):  # type: ignore[no-untyped-def]
     """Information (n, n) on the shared unknowns and on the features' radii, and (edges,) on each edge's own place.
 
     columns are the derivatives (5, rows, columns) with respect to dv, du, rotation, brightness and background of the
-    whole scene; weight is one over the variance, zero where a pixel does not count.
+    whole scene, whose information among themselves is left out; weight is one over the variance, zero where a pixel
+    does not count.
     """
     information = np.zeros((SHARED + features, SHARED + features))
     alone = np.zeros(d.edges.shape[1])
     index, value = np.zeros(MOST, np.int64), np.zeros(MOST)
-    places, numbers = np.zeros(SHARED + MOST, np.int64), np.zeros(SHARED + MOST)
+    places, numbers = np.arange(SHARED + MOST), np.zeros(SHARED + MOST)
     for row in range(weight.shape[0]):
         for column in range(weight.shape[1]):
-            if weight[row, column] <= 0.0:
-                continue
             i, j = row + BORDER_PX + 1, column + BORDER_PX + 1
-            down = 0.5 * (across[i + 1, j] - across[i - 1, j])
-            right = 0.5 * (across[i, j + 1] - across[i, j - 1])
-            found, slope_v, slope_u = edge_slopes(s, d, across[i, j], down, right, sigma_px, factor, index, value)
+            slope_v, slope_u, _ = radius_slopes(radii, i, j)
+            slope = np.sqrt(slope_v * slope_v + slope_u * slope_u)
+            if weight[row, column] <= 0.0 or slope <= 0.0:
+                continue
+            found = edge_slopes(s, d, across[i, j], radii[i, j], slope, sigma_px, factor, index, value)
+            if found == 0:
+                continue
             own = 0.0
             for k in range(found):
                 own += value[k]
-                alone[index[k]] += weight[row, column] * value[k] ** 2 * (slope_v * slope_v + slope_u * slope_u)
+                alone[index[k]] += weight[row, column] * (value[k] * slope) ** 2
                 places[SHARED + k], numbers[SHARED + k] = SHARED + owner[index[k]], value[k]
-            for k in range(3):
-                numbers[k] = columns[k, row, column]
+            for k in range(5):
+                numbers[WHOLE_AND_LEVELS[k]] = columns[k, row, column]
             # The light depends on the radius less the edge's: rings that move along v carry it against the gradient.
             numbers[3], numbers[4] = own * slope_v, own * slope_u
             numbers[5] = numbers[3] * (column - middle[1]) - numbers[4] * (row - middle[0])
-            numbers[6], numbers[7] = columns[3, row, column], columns[4, row, column]
-            places[:SHARED] = np.arange(SHARED)
             for a in range(SHARED + found):
+                whole = a < 3 or 6 <= a < SHARED
                 for b in range(SHARED + found):
-                    information[places[a], places[b]] += weight[row, column] * numbers[a] * numbers[b]
+                    if not (whole and (b < 3 or 6 <= b < SHARED)):
+                        information[places[a], places[b]] += weight[row, column] * numbers[a] * numbers[b]
     return information, alone
 
 
@@ -198,10 +197,13 @@ def ring_information(shot: Shot, scene: Scene, disc: RingDisc, useless: NDArray[
     owner = np.array([k for _, k in sorted_edges()])
     sigma = float(np.sqrt(optics.psf_sigma_px**2 + 1.0 / 12.0))
     factor = scene.factor * (1.0 - shot.camera.wings[0])
+    across, weight = directions(shot.seen_with), np.where(useless, 0.0, 1.0 / variance)
     information, alone = gather_information(
-        scene.spheres, disc, directions(shot.seen_with), columns, np.where(useless, 0.0, 1.0 / variance), owner, sigma,
-        factor, optics.centre_vu, len(FEATURES),
+        scene.spheres, disc, across, radius_grid(disc, across), columns, weight, owner, sigma, factor,
+        optics.centre_vu, len(FEATURES),
     )  # fmt: skip
+    flat = columns.reshape(len(columns), -1)
+    information[np.ix_(WHOLE_AND_LEVELS, WHOLE_AND_LEVELS)] = (flat * weight.ravel()) @ flat.T
     prior = np.concatenate([np.zeros(SHARED), [1.0 / f.sigma_a_km**2 for f in FEATURES]])
     return information, alone, prior
 
