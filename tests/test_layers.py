@@ -29,7 +29,7 @@ LEVELS = (
 FOUNDATIONS = {
     "geometry": ("rotations", "shape", "rays", "maplet"),
     "imaging": ("psf", "illumination", "render"),
-    "pose": ("records", "se3", "normalise", "refine", "pnp", "ransac", "graph", "estimator", "triangulation"),
+    "pose": ("records", "se3", "normalise", "refine", "pnp", "ransac", "graph", "estimator", "triangulation", "views"),
     "predict": ("bodies",),
     "techniques": (
         "base", "star_fit", "star_match", "star_search", "star_inventory", "body_base", "body_search", "model_errors",

@@ -19,7 +19,7 @@ from catalogs.archive import Archive, open_archive
 from catalogs.images import read_image
 from pipeline.curate import Json
 from pipeline.errors import ConfigurationError, PilotageError
-from workflows import catalog_cli, sample_cli
+from workflows import catalog_cli, pose_cli, sample_cli
 from workflows.ck import FOLDER, write_c_kernels
 from workflows.config import Configuration, load_configuration, parse_setting
 from workflows.execute import ClusterOptions
@@ -43,6 +43,7 @@ app = typer.Typer(
 )  # fmt: skip
 app.add_typer(sample_cli.app, name="sample")
 app.add_typer(catalog_cli.app, name="catalog")
+app.command()(pose_cli.pose)
 
 _LOG = logging.getLogger("pilotage")
 _ARCHIVE_KEY = "archive."

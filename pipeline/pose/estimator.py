@@ -190,9 +190,7 @@ class OpenCVGtsamPoseEstimator:
         self._doubt(matches, best)
         return best
 
-    def _settle_all(
-        self, matches: _Matches, start: BoolArray, candidates: list[tuple[str, Pose]]
-    ) -> list[_Solution]:
+    def _settle_all(self, matches: _Matches, start: BoolArray, candidates: list[tuple[str, Pose]]) -> list[_Solution]:
         return [s for name, pose in candidates if (s := self._settle(matches, start, name, pose)) is not None]
 
     def _settle(self, matches: _Matches, start: BoolArray, method: str, pose: Pose) -> _Solution | None:
@@ -233,11 +231,11 @@ class OpenCVGtsamPoseEstimator:
 
     def _choose(self, matches: _Matches, found: list[_Solution]) -> _Solution:
         """Best of the minima; refused where another, different one is about as good."""
+        best = min(found, key=lambda s: (-int(s.inlier.sum()), s.fit.chi2))
         # Starts that meet differ by rounding only: the first of them gives the name.
-        found = sorted(found, key=lambda s: (-int(s.inlier.sum()), round(s.fit.chi2, 3)))
-        best = found[0]
+        best = next(s for s in found if s.inlier.sum() == best.inlier.sum() and _same(best.fit, s.fit))
         gate2 = self.options.ransac.gate_sigma**2
-        for other in found[1:]:
+        for other in found:
             lost = int(best.inlier.sum() - other.inlier.sum())
             worse = other.fit.chi2 * (other.scale / best.scale) ** 2 - best.fit.chi2 + lost * gate2
             if worse < self.options.ambiguity_chi2 and not _same(best.fit, other.fit):

@@ -41,6 +41,7 @@ class SourceLabel(StrEnum):
 class PnpFailure(StrEnum):
     """Why no pose came out."""
 
+    BAD_INPUT = "bad_input"
     TOO_FEW = "too_few"
     NO_CONSENSUS = "no_consensus"
     DEGENERATE = "degenerate"

@@ -1,0 +1,218 @@
+"""Matches of many views and the cameras that saw them: ``MATCHES.parquet`` and ``cameras.json``."""
+
+import json
+from dataclasses import dataclass
+from io import BytesIO
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+
+from pipeline.errors import ConfigurationError
+from pipeline.geometry.wgs84 import Datum, wgs84
+from pipeline.pose.normalise import pinhole_camera
+from pipeline.pose.records import MatchError, Pose
+from pipeline.records import CameraModel, FloatArray, Record
+
+_REQUIRED = ("view_id", "point_id", "v_px", "u_px")
+_PIXEL_COVARIANCE = ("cov_vv", "cov_vu", "cov_uu")
+_PLACE = ("x_km", "y_km", "z_km")
+_POINT_COVARIANCE = ("cov_xx_km2", "cov_xy_km2", "cov_xz_km2", "cov_yy_km2", "cov_yz_km2", "cov_zz_km2")
+
+
+@dataclass(frozen=True, eq=False)
+class MatchTable(Record):
+    """All matches of a file as one struct of arrays; values are checked where a view is solved.
+
+    Attributes
+    ----------
+    view_id, point_id
+        (n,).
+    pixels_vu
+        (n, 2).
+    pixel_covariance_px2
+        (n, 2, 2) in the order (v, u); None where the file has none.
+    points_km
+        (n, 3); None where the file has none.
+    point_covariance_km2
+        (n, 3, 3); None where the file has none.
+    """
+
+    view_id: FloatArray
+    point_id: FloatArray
+    pixels_vu: FloatArray
+    pixel_covariance_px2: FloatArray | None
+    points_km: FloatArray | None
+    point_covariance_km2: FloatArray | None
+
+    def __post_init__(self) -> None:
+        n = len(self.view_id)
+        self._freeze(
+            view_id=(n,), point_id=(n,), pixels_vu=(n, 2), pixel_covariance_px2=(n, 2, 2), points_km=(n, 3),
+            point_covariance_km2=(n, 3, 3),
+        )  # fmt: skip
+
+    def take(self, which: FloatArray) -> "MatchTable":
+        """Rows of an index or mask."""
+        return MatchTable(
+            self.view_id[which], self.point_id[which], self.pixels_vu[which],
+            *(None if a is None else a[which] for a in (
+                self.pixel_covariance_px2, self.points_km, self.point_covariance_km2
+            )),
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Cameras:
+    """What ``cameras.json`` says.
+
+    Attributes
+    ----------
+    camera
+        The one camera of all views.
+    datum
+        Ellipsoid of the body.
+    poses
+        Given poses by view id, in the order of the file.
+    """
+
+    camera: CameraModel
+    datum: Datum
+    poses: dict[int, Pose]
+
+
+def _text(names: tuple[str, ...] | list[str]) -> str:
+    return ", ".join(names)
+
+
+def read_matches(data: bytes, name: str) -> MatchTable:
+    """Read and check a table of matches.
+
+    Parameters
+    ----------
+    data
+        A Parquet file: ``view_id, point_id, v_px, u_px``; optionally ``cov_vv, cov_vu, cov_uu`` (px^2),
+        ``x_km, y_km, z_km`` and ``cov_xx_km2`` ... ``cov_zz_km2``.
+    name
+        For messages.
+
+    Returns
+    -------
+    MatchTable
+        Its rows in their order.
+
+    Raises
+    ------
+    ConfigurationError
+        If the file cannot be read, a column is missing or of the wrong kind, or it has no rows.
+    """
+    try:
+        table = pd.read_parquet(BytesIO(data))
+    except (pa.ArrowException, OSError, ValueError) as error:
+        raise ConfigurationError(f"{name}: no Parquet table ({str(error).splitlines()[0]})") from error
+    missing = [column for column in _REQUIRED if column not in table]
+    if missing:
+        raise ConfigurationError(f"{name}: no column {_text(missing)}; matches need {_text(_REQUIRED)}")
+    if not len(table):
+        raise ConfigurationError(f"{name}: no rows")
+    ids = [_integers(table, column, name) for column in _REQUIRED[:2]]
+    pixel = _columns(table, _PIXEL_COVARIANCE, name)
+    point = _columns(table, _POINT_COVARIANCE, name)
+    places = _columns(table, _PLACE, name)
+    if point is not None and places is None:
+        raise ConfigurationError(f"{name}: covariances of points without {_text(_PLACE)}")
+    pixels = _columns(table, _REQUIRED[2:], name)
+    assert pixels is not None
+    return MatchTable(
+        ids[0], ids[1], pixels, None if pixel is None else _symmetric(pixel, 2), places,
+        None if point is None else _symmetric(point, 3),
+    )  # fmt: skip
+
+
+def _integers(table: pd.DataFrame, column: str, name: str) -> FloatArray:
+    values = pd.to_numeric(table[column], errors="coerce")
+    whole = values.notna() & (values % 1 == 0)
+    if not whole.all():
+        raise ConfigurationError(f"{name}: {column} of row {int(np.flatnonzero(~whole)[0])} is no whole number")
+    return values.to_numpy(np.int64)
+
+
+def _columns(table: pd.DataFrame, names: tuple[str, ...], name: str) -> FloatArray | None:
+    """(n, k) of columns that come together or not at all."""
+    have = [column for column in names if column in table]
+    if not have:
+        return None
+    if len(have) < len(names):
+        raise ConfigurationError(f"{name}: {_text(have)} without the others of {_text(names)}")
+    kinds = [column for column in names if not pd.api.types.is_numeric_dtype(table[column])]
+    if kinds:
+        raise ConfigurationError(f"{name}: {_text(kinds)} hold no numbers")
+    return table[list(names)].to_numpy(np.float64)
+
+
+def _symmetric(upper: FloatArray, size: int) -> FloatArray:
+    full = np.zeros((len(upper), size, size))
+    for k, (i, j) in enumerate(zip(*np.triu_indices(size), strict=True)):
+        full[:, i, j] = full[:, j, i] = upper[:, k]
+    return full
+
+
+def read_cameras(data: bytes, name: str) -> Cameras:
+    """Read ``cameras.json``.
+
+    Parameters
+    ----------
+    data
+        ``{K, shape_vu, views: [{view_id, position_km, camera_from_body}], datum: {name, radii_km}}``; K maps (x, y, 1)
+        to (u, v, 1). In the place of K, ``camera_model`` as in a sidecar. Without a datum WGS 84 is meant.
+    name
+        For messages.
+
+    Returns
+    -------
+    Cameras
+        The camera and the poses given.
+
+    Raises
+    ------
+    ConfigurationError
+        If it is no such file.
+    """
+    try:
+        content = json.loads(data)
+        views = content["views"]
+        poses = {int(view["view_id"]): _pose(view) for view in views}
+        doubled = len(poses) < len(views)
+        datum = Datum(content["datum"]["name"], content["datum"]["radii_km"]) if "datum" in content else wgs84()
+        camera = _camera(content)
+    except (ValueError, TypeError, KeyError) as error:
+        what = f"no {error}" if isinstance(error, KeyError) else str(error)
+        raise ConfigurationError(f"{name}: {what}") from error
+    except MatchError as error:
+        raise ConfigurationError(f"{name}: {error}") from error
+    if doubled:
+        raise ConfigurationError(f"{name}: a view is given twice")
+    return Cameras(camera, datum, poses)
+
+
+def _pose(view: dict[str, FloatArray]) -> Pose:
+    turn = np.asarray(view["camera_from_body"], dtype=float)
+    place = np.asarray(view["position_km"], dtype=float)
+    if turn.shape != (3, 3) or place.shape != (3,):
+        raise MatchError(f"view {view['view_id']}: camera_from_body is 3 by 3, position_km has three numbers")
+    try:
+        return Pose(turn, place)
+    except MatchError as error:
+        raise MatchError(f"view {view['view_id']}: {error}") from error
+
+
+def _camera(content: dict[str, FloatArray]) -> CameraModel:
+    if "camera_model" not in content:
+        rows, cols = (int(n) for n in content["shape_vu"])
+        return pinhole_camera(np.asarray(content["K"], dtype=float), (rows, cols))
+    model: dict[str, FloatArray] = content["camera_model"]  # type: ignore[assignment]
+    rows, cols = (int(n) for n in model["shape_vu"])
+    return CameraModel(
+        (rows, cols), float(model["focal_length_mm"]), model["k_px_per_mm"], model["principal_point_vu"],
+        model.get("distortion_eps", np.zeros(6)),
+    )  # fmt: skip

@@ -1,0 +1,197 @@
+"""``pilotage pose`` on planted views: right, whole, and one clear error for each bad file."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pyarrow.parquet as pq
+import pytest
+from typer.testing import CliRunner
+
+from pipeline.camera import project
+from pipeline.geometry.rotations import matrix_from_quaternion
+from pipeline.pose.normalise import pinhole_camera
+from pipeline.pose.records import Pose
+from pipeline.pose.se3 import SE3Utils
+from workflows.cli import app
+
+K = np.array([[5000.0, 0.0, 511.5], [0.0, 5000.0, 511.5], [0.0, 0.0, 1.0]])
+COLUMNS = ["view_id", "x_km", "y_km", "z_km", "qw", "qx", "qy", "qz"]
+COLUMNS += [f"cov_{i}{j}" for i in range(6) for j in range(i, 6)] + ["rms_px", "label"]
+
+
+def _looking(place: np.ndarray) -> Pose:
+    z = -place / np.linalg.norm(place)
+    x = np.cross([0, 0, 1.0], z)
+    x /= np.linalg.norm(x)
+    return Pose(np.stack([x, np.cross(z, x), z]), place)
+
+
+def _views(seed: int = 0) -> tuple[pd.DataFrame, list[Pose], np.ndarray]:
+    """Nine views of a bumpy ball, tracks with a quarter of a pixel of noise and a few that are wrong."""
+    rng = np.random.default_rng(seed)
+    poses = [_looking(2000 * np.array([np.cos(a), np.sin(a), 0.3 * np.sin(3 * a)])) for a in np.linspace(0, 0.8, 9)]
+    direction = rng.normal(size=(3000, 3))
+    points = direction / np.linalg.norm(direction, axis=1)[:, None] * rng.uniform(140, 170, (3000, 1))
+    camera, rows = pinhole_camera(K, (1024, 1024)), []
+    for view, pose in enumerate(poses):
+        pixels, _ = project(camera, pose.to_camera(points))
+        seen = (points @ pose.position_km > 0) & (rng.random(3000) < 0.25)
+        pixels = pixels + rng.normal(size=pixels.shape) * 0.25
+        wrong = rng.random(3000) < 0.03
+        pixels[wrong] = rng.uniform(0, 1023, (wrong.sum(), 2))
+        index = np.flatnonzero(seen)
+        v, u = pixels[index].T
+        rows.append(pd.DataFrame({"point_id": index + 7, "view_id": view * 10, "v_px": v, "u_px": u}))
+    return pd.concat(rows, ignore_index=True), poses, points
+
+
+def _cameras(folder: Path, poses: list[Pose], given: list[int], sign: float = 1.0) -> Path:
+    views = [
+        {
+            "view_id": k * 10, "position_km": (sign * poses[k].position_km).tolist(),
+            "camera_from_body": poses[k].camera_from_body.tolist(),
+        }
+        for k in given
+    ]  # fmt: skip
+    path = folder / "cameras.json"
+    path.write_text(json.dumps({"K": K.tolist(), "shape_vu": [1024, 1024], "views": views}))
+    return path
+
+
+def _run(matches: Path, cameras: Path, output: Path, *more: str) -> tuple[int, str, BaseException | None]:
+    result = CliRunner().invoke(app, ["pose", str(matches), "--cameras", str(cameras), "--output", str(output), *more])
+    return result.exit_code, result.output, result.exception
+
+
+def _pose_of(row: pd.Series, sign: float = 1.0) -> tuple[Pose, np.ndarray]:
+    turn = matrix_from_quaternion(row[["qw", "qx", "qy", "qz"]].to_numpy(float))
+    covariance = np.zeros((6, 6))
+    for i in range(6):
+        for j in range(i, 6):
+            covariance[i, j] = covariance[j, i] = row[f"cov_{i}{j}"]
+    return Pose(turn, sign * row[["x_km", "y_km", "z_km"]].to_numpy(float)), covariance
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_views_without_poses_are_solved_from_the_others(tmp_path: Path, sign: float) -> None:
+    table, poses, _ = _views()
+    table.to_parquet(tmp_path / "m.parquet")
+    cameras = _cameras(tmp_path, poses, [0, 1, 2, 3, 5, 6, 8], sign)
+    code, text, _ = _run(tmp_path / "m.parquet", cameras, tmp_path / "p.parquet")
+    assert code == 0, text
+    answers = pd.read_parquet(tmp_path / "p.parquet")
+    assert list(answers.columns) == COLUMNS
+    assert answers.view_id.tolist() == [40, 70]
+    assert (answers.label == "satellite_anchored").all()
+    assert ("look away" in text) == (sign < 0)
+    assert b"Exp(r)" in pq.read_schema(tmp_path / "p.parquet").metadata[b"frame"]
+    for row, true in zip(answers.iloc, (poses[4], poses[7]), strict=True):
+        pose, covariance = _pose_of(row, sign)
+        error = SE3Utils.error(pose, true)
+        if sign < 0:
+            error[:3] *= -1
+        assert error @ np.linalg.solve(covariance, error) < 30
+        assert np.linalg.norm(error[:3]) < 3
+        assert 0.2 < row.rms_px < 0.6
+
+
+def test_every_view_and_cheap_covariances(tmp_path: Path) -> None:
+    table, poses, _ = _views(1)
+    table.to_parquet(tmp_path / "m.parquet")
+    cameras = _cameras(tmp_path, poses, list(range(8)))
+    code, text, _ = _run(tmp_path / "m.parquet", cameras, tmp_path / "a.parquet", "--every")
+    assert code == 0
+    assert "against 8 given poses" in text
+    full = pd.read_parquet(tmp_path / "a.parquet")
+    assert len(full) == 9
+    _run(tmp_path / "m.parquet", cameras, tmp_path / "b.parquet", "--every", "--covariance", "jacobian")
+    cheap = pd.read_parquet(tmp_path / "b.parquet")
+    assert not np.array_equal(full.cov_00, cheap.cov_00)
+    np.testing.assert_allclose(np.sqrt(cheap.cov_00 / full.cov_00), 1.0, atol=0.1)
+
+
+def test_places_of_points_may_come_with_the_matches(tmp_path: Path) -> None:
+    table, poses, points = _views(2)
+    table[["x_km", "y_km", "z_km"]] = points[table.point_id - 7]
+    table["cov_vv"], table["cov_vu"], table["cov_uu"] = 0.0625, 0.0, 0.0625
+    table = table[(table.view_id != 30) | (np.arange(len(table)) % 200 == 0)]
+    table.to_parquet(tmp_path / "m.parquet")
+    code, text, _ = _run(tmp_path / "m.parquet", _cameras(tmp_path, poses, []), tmp_path / "p.parquet")
+    answers = pd.read_parquet(tmp_path / "p.parquet").set_index("view_id")
+    assert code == 1
+    assert "view 30: " in text
+    assert np.isnan(answers.loc[30, "x_km"])
+    assert answers.loc[30, "label"] == "dead_reckoned"
+    nees = []
+    for view, row in answers.drop(index=30).iterrows():
+        pose, covariance = _pose_of(row)
+        error = SE3Utils.error(pose, poses[int(view) // 10])  # type: ignore[call-overload]
+        nees.append(error @ np.linalg.solve(covariance, error))
+    # Mean of eight chi2 of six: sigma 1.2.
+    assert 2 < np.mean(nees) < 11
+
+
+def _broken(kind: str, table: pd.DataFrame) -> pd.DataFrame:
+    if kind == "nan":
+        table.loc[table.index[table.view_id == 40][5], "v_px"] = np.nan
+    elif kind == "doubled":
+        table = pd.concat([table, table[table.view_id == 40].iloc[:1]])
+    elif kind == "sigma":
+        table["cov_vv"], table["cov_vu"], table["cov_uu"] = 0.1, 0.0, 0.1
+        table.loc[table.index[table.view_id == 40][3], "cov_vv"] = -0.1
+    return table
+
+
+@pytest.mark.parametrize(("kind", "view"), [("nan", 40), ("doubled", 40), ("sigma", 40)])
+def test_a_bad_view_is_one_line_and_the_others_stay(tmp_path: Path, kind: str, view: int) -> None:
+    table, poses, _ = _views(3)
+    _broken(kind, table).to_parquet(tmp_path / "m.parquet")
+    cameras = _cameras(tmp_path, poses, [0, 1, 2, 3, 5, 6, 8])
+    code, text, _ = _run(tmp_path / "m.parquet", cameras, tmp_path / "p.parquet")
+    answers = pd.read_parquet(tmp_path / "p.parquet").set_index("view_id")
+    assert code == 1
+    assert text.count(f"view {view}: ") == 1
+    assert answers.x_km.notna().tolist() == [False, True]
+
+
+@pytest.mark.parametrize(("change", "message"), [
+    (lambda t: t.drop(columns="u_px"), "no column u_px"), (lambda t: t.iloc[:0], "no rows"),
+    (lambda t: t.assign(cov_vv=1.0), "cov_vv without the others"), (lambda t: t.assign(x_km=0.0), "x_km without"),
+    (lambda t: t.assign(view_id=t.view_id + 0.5), "view_id of row 0 is no whole number"),
+    (lambda t: t.assign(v_px="a"), "v_px hold no numbers"),
+])  # fmt: skip
+def test_a_bad_table_is_one_error(tmp_path: Path, change, message: str) -> None:  # type: ignore[no-untyped-def]
+    table, poses, _ = _views(4)
+    change(table).to_parquet(tmp_path / "m.parquet")
+    _, _, error = _run(tmp_path / "m.parquet", _cameras(tmp_path, poses, [0, 1]), tmp_path / "p.parquet")
+    assert message in str(error)
+    assert not (tmp_path / "p.parquet").exists()
+
+
+@pytest.mark.parametrize(("change", "message"), [
+    (lambda c: c.pop("K"), "no 'K'"), (lambda c: c["K"][0].__setitem__(0, 0.0), "K is singular"),
+    (lambda c: c["views"].append(c["views"][0]), "given twice"),
+    (lambda c: c["views"][0]["camera_from_body"][0].__setitem__(0, 3.0), "view 0: camera_from_body is not a rotation"),
+    (lambda c: c["views"][0]["position_km"].__setitem__(0, float("nan")), "view 0: position_km is not finite"),
+    (lambda c: c["views"][0]["position_km"].pop(), "three numbers"),
+    (lambda c: c["views"].clear(), "fewer than two views"),
+])  # fmt: skip
+def test_bad_cameras_are_one_error(tmp_path: Path, change, message: str) -> None:  # type: ignore[no-untyped-def]
+    table, poses, _ = _views(4)
+    table.to_parquet(tmp_path / "m.parquet")
+    path = _cameras(tmp_path, poses, [0, 1])
+    content = json.loads(path.read_text())
+    change(content)
+    path.write_text(json.dumps(content))
+    _, _, error = _run(tmp_path / "m.parquet", path, tmp_path / "p.parquet")
+    assert message in str(error)
+
+
+def test_what_is_not_there_or_no_table_is_one_error(tmp_path: Path) -> None:
+    _, poses, _ = _views(4)
+    cameras = _cameras(tmp_path, poses, [0, 1])
+    assert "No such file" in str(_run(tmp_path / "none", cameras, tmp_path / "p")[2])
+    (tmp_path / "text").write_text("hello")
+    assert "no Parquet table" in str(_run(tmp_path / "text", cameras, tmp_path / "p")[2])

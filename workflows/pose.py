@@ -1,0 +1,259 @@
+"""From matches and cameras to a table of poses."""
+
+import time
+import warnings
+from collections.abc import Iterable
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+import pyarrow as pa
+
+from catalogs.matches import Cameras, MatchTable
+from pipeline.errors import ConfigurationError
+from pipeline.geometry.rotations import quaternion_from_matrix
+from pipeline.pose.estimator import OpenCVGtsamPoseEstimator, PoseOptions
+from pipeline.pose.records import (
+    CameraCalibration,
+    CovarianceDegradedWarning,
+    PnpFailureError,
+    Pose,
+    PoseEstimate,
+    SourceLabel,
+    ThermalState,
+)
+from pipeline.pose.se3 import SE3Utils
+from pipeline.pose.triangulation import Intersections
+from pipeline.pose.views import (
+    Sightings,
+    looks_away,
+    matches_of,
+    sigma_of,
+    solve_view,
+    triangulate_views,
+    turned,
+)
+from pipeline.records import FloatArray
+
+_UPPER = tuple((i, j) for i in range(6) for j in range(i, 6))
+_FRAME = (
+    "x_cam = camera_from_body (X - position), quaternion of camera_from_body scalar first; cov: upper triangle by rows "
+    "of the errors (x, y, z, rx, ry, rz), km and rad, body-fixed, position estimated minus true and "
+    "body_from_camera_true = Exp(r) body_from_camera_estimated"
+)
+_TO_BODY = (
+    "; positions as in the cameras' file: vectors from the camera to the body, x_cam = camera_from_body (X + position)"
+)
+
+
+class CovarianceChoice(StrEnum):
+    """How covariances are made: always one way, or cheaply once the run's time is used up."""
+
+    MARGINALS = "marginals"
+    JACOBIAN = "jacobian"
+    AUTO = "auto"
+
+
+@dataclass(frozen=True)
+class Budget:
+    """Compute budget of a run.
+
+    Attributes
+    ----------
+    choice
+        What was asked for.
+    seconds
+        After which ``auto`` turns cheap; None for never.
+    """
+
+    choice: CovarianceChoice
+    seconds: float | None = None
+
+    def state(self, started: float) -> ThermalState:
+        """State of the budget now, for a run that started at a time of the monotonic clock."""
+        spent = self.seconds is not None and time.monotonic() - started > self.seconds
+        return ThermalState(
+            self.choice is CovarianceChoice.JACOBIAN or (self.choice is CovarianceChoice.AUTO and spent)
+        )
+
+
+@dataclass(frozen=True)
+class PoseRow:
+    """Answer for one view; ``answer`` is the failure where there is no pose."""
+
+    view_id: int
+    answer: PoseEstimate | PnpFailureError
+
+
+@dataclass(frozen=True)
+class Views:
+    """All views of a file, in the order of their ids."""
+
+    ids: FloatArray
+    points: FloatArray
+    sightings: Sightings
+    given: dict[int, Pose]
+    turned: bool
+    calibration: CameraCalibration
+    options: PoseOptions
+    table: MatchTable
+
+    def places(self, without: int | None = None) -> Intersections:
+        """Places of all points: those of the file, else from the given views but one."""
+        if self.table.points_km is not None:
+            return _given_places(self)
+        poses = {view: pose for view, pose in self.given.items() if view != without}
+        sigma = self.options.assumed_sigma_px
+        return triangulate_views(self.calibration.camera, self.sightings, poses, len(self.points), sigma)
+
+
+def _given_places(views: Views) -> Intersections:
+    table, count = views.table, len(views.points)
+    assert table.points_km is not None
+    # The file repeats a point's place in every row; the first is the one that counts.
+    _, first = np.unique(table.point_id, return_index=True)
+    places = table.points_km[first]
+    spread = np.zeros((count, 3, 3)) if table.point_covariance_km2 is None else table.point_covariance_km2[first]
+    return Intersections(places, spread, np.zeros(count, dtype=np.int64))
+
+
+def prepare(table: MatchTable, cameras: Cameras) -> Views:
+    """Order views and points, and read the sense in which positions are written.
+
+    Parameters
+    ----------
+    table
+        All matches.
+    cameras
+        Camera, datum and given poses.
+
+    Returns
+    -------
+    Views
+        Ready to be solved.
+
+    Raises
+    ------
+    ConfigurationError
+        If points have no places and fewer than two poses are given.
+    """
+    named = np.concatenate([table.view_id, np.array(list(cameras.poses), dtype=np.int64)])
+    ids, view = np.unique(named, return_inverse=True)
+    points, point = np.unique(table.point_id, return_inverse=True)
+    sightings = Sightings(view[: len(table.view_id)], point, table.pixels_vu, table.pixel_covariance_px2)
+    given = {int(np.searchsorted(ids, key)): pose for key, pose in cameras.poses.items()}
+    calibration = CameraCalibration.of(cameras.camera, cameras.datum)
+    plain = Views(ids, points, sightings, given, False, calibration, PoseOptions(), table)
+    if table.points_km is not None:
+        return plain
+    if len(given) < 2:
+        raise ConfigurationError("points have no places (x_km, y_km, z_km), and fewer than two views have poses")
+    away = looks_away(plain.places())
+    given = {key: turned(pose) for key, pose in given.items()} if away else given
+    options = PoseOptions()
+    if table.pixel_covariance_px2 is None:
+        places = triangulate_views(cameras.camera, sightings, given, len(points), options.assumed_sigma_px)
+        if places.ok.any():
+            sigma = sigma_of(cameras.camera, sightings, given, places.places_km)
+            options = PoseOptions(assumed_sigma_px=max(sigma, 1e-6))
+    return Views(ids, points, sightings, given, away, calibration, options, table)
+
+
+def solve_views(views: Views, budget: Budget, every: bool) -> Iterable[PoseRow]:
+    """Solve the views without poses, each alone.
+
+    Parameters
+    ----------
+    views
+        Of :func:`prepare`.
+    budget
+        For covariances.
+    every
+        Also solve the views whose poses are given, each with points from the others.
+
+    Yields
+    ------
+    PoseRow
+        In the order of their ids; position in the sense of the cameras' file.
+    """
+    estimator = OpenCVGtsamPoseEstimator(views.options)
+    places, started = views.places(), time.monotonic()
+    exact = views.table.points_km is not None and views.table.point_covariance_km2 is None
+    for view, view_id in enumerate(views.ids):
+        if view in views.given and not every:
+            continue
+        mine = places if view not in views.given or views.table.points_km is not None else views.places(view)
+        matches = matches_of(str(view_id), views.sightings, views.sightings.view == view, mine, exact)
+        if isinstance(matches, PnpFailureError):
+            yield PoseRow(int(view_id), matches)
+            continue
+        with warnings.catch_warnings():
+            # The log has a line per throttled frame; Python's own warnings would say the first one only.
+            warnings.simplefilter("ignore", CovarianceDegradedWarning)
+            yield PoseRow(int(view_id), solve_view(estimator, views.calibration, matches, budget.state(started)))
+
+
+def compare_given(views: Views, rows: list[PoseRow]) -> FloatArray:
+    """Differences to the given poses.
+
+    Parameters
+    ----------
+    views
+        With their given poses.
+    rows
+        Answers.
+
+    Returns
+    -------
+    numpy.ndarray
+        (n, 5): distance in km, angle in rad, rms along v and u in px, NEES; one row per given view with an answer.
+    """
+    found = []
+    for row in rows:
+        view = int(np.searchsorted(views.ids, row.view_id))
+        if view in views.given and isinstance(row.answer, PoseEstimate):
+            error = SE3Utils.error(row.answer.pose, views.given[view])
+            nees = float(error @ np.linalg.solve(row.answer.covariance_6x6, error))
+            found.append([np.linalg.norm(error[:3]), np.linalg.norm(error[3:]), *row.answer.rms_px, nees])
+    return np.array(found).reshape(-1, 5)
+
+
+def pose_table(views: Views, rows: list[PoseRow]) -> pa.Table:
+    """Arrow table of the answers.
+
+    Parameters
+    ----------
+    views
+        For the sense of positions.
+    rows
+        Answers.
+
+    Returns
+    -------
+    pyarrow.Table
+        ``view_id, x_km, y_km, z_km, qw, qx, qy, qz, cov_00 ... cov_55, rms_px, label``; null where there is no pose.
+    """
+    names = ["view_id", "x_km", "y_km", "z_km", "qw", "qx", "qy", "qz"]
+    names += [f"cov_{i}{j}" for i, j in _UPPER] + ["rms_px", "label"]
+    kinds = [pa.int64(), *[pa.float64()] * (len(names) - 2), pa.string()]
+    meta = {"frame": _FRAME + (_TO_BODY if views.turned else "")}
+    schema = pa.schema(list(zip(names, kinds, strict=True)), metadata=meta)
+    content = [dict(zip(names, _values(row, views.turned), strict=True)) for row in rows]
+    return pa.Table.from_pylist(content, schema=schema)
+
+
+def _values(row: PoseRow, turn: bool) -> list[int | float | str | None]:
+    answer = row.answer
+    if isinstance(answer, PnpFailureError):
+        return [row.view_id, *[None] * (7 + len(_UPPER) + 1), SourceLabel.DEAD_RECKONED.value]
+    pose, covariance = answer.pose, answer.covariance_6x6
+    if turn:
+        pose, covariance = turned(pose), SE3Utils.error_from_correction(covariance)
+    # Per axis: the mean of both axes' squares.
+    rms = float(np.sqrt((answer.rms_px**2).mean()))
+    numbers = [
+        *pose.position_km,
+        *quaternion_from_matrix(pose.camera_from_body),
+        *(covariance[i, j] for i, j in _UPPER),
+    ]
+    return [row.view_id, *map(float, numbers), rms, answer.source_label.value]

@@ -1,0 +1,68 @@
+"""``pilotage pose``: poses from matches that any program made."""
+
+import logging
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import typer
+
+from pipeline.errors import ConfigurationError
+from pipeline.pose.records import PnpFailureError
+from workflows.store import write_atomically
+
+
+def _read(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise ConfigurationError(f"{path}: {error.strerror}") from error
+
+
+def pose(
+    matches: Annotated[Path, typer.Argument(help="Parquet: view_id, point_id, v_px, u_px; places and covariances.")],
+    cameras: Annotated[Path, typer.Option("--cameras", help="JSON: K and shape_vu or camera_model, views with poses.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Parquet to write.")],
+    every: Annotated[bool, typer.Option("--every", help="Also solve views with given poses, from the others.")] = False,
+    covariance: Annotated[
+        Literal["auto", "marginals", "jacobian"], typer.Option(help="Graph marginals, Jacobian, or by budget.")
+    ] = "auto",
+    budget_s: Annotated[float | None, typer.Option(min=0.0, help="Seconds after which auto turns cheap.")] = None,
+    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="A JSON line per view.")] = False,
+) -> None:
+    """Solve views from points of known place, or of places that views with given poses make known.
+
+    Exit code: 0 all views solved, 1 some without a pose, 3 could not start.
+    """
+    # The factor graph's library takes a while to load, which no other command should pay.
+    from catalogs.matches import read_cameras, read_matches
+    from workflows.pose import Budget, CovarianceChoice, compare_given, pose_table, prepare, solve_views
+
+    logging.basicConfig(level=logging.CRITICAL, format="%(message)s")
+    logging.getLogger("pilotage.pose").setLevel(logging.DEBUG if verbose else logging.CRITICAL)
+    views = prepare(
+        read_matches(_read(matches), str(matches)), read_cameras(_read(cameras), str(cameras))
+    )  # fmt: skip
+    if views.turned:
+        typer.echo(
+            f"{cameras}: the given cameras look away from their points; positions are read, and written, as vectors "
+            "from the camera to the body", err=True,
+        )  # fmt: skip
+    rows = list(solve_views(views, Budget(CovarianceChoice(covariance), budget_s), every))
+    failed = [row for row in rows if isinstance(row.answer, PnpFailureError)]
+    for row in failed:
+        typer.echo(f"view {row.view_id}: {row.answer}", err=True)
+    sink = pa.BufferOutputStream()
+    pq.write_table(pose_table(views, rows), sink)
+    write_atomically(output, sink.getvalue().to_pybytes())
+    typer.echo(f"{len(rows)} views, {len(rows) - len(failed)} with a pose, in {output}")
+    given = compare_given(views, rows)
+    if len(given):
+        middle = np.median(given, axis=0)
+        typer.echo(
+            f"against {len(given)} given poses, medians: {middle[0]:.3g} km, {1e3 * middle[1]:.3g} mrad, "
+            f"rms {middle[2]:.2f} and {middle[3]:.2f} px, NEES {middle[4]:.1f}"
+        )
+    raise typer.Exit(1 if failed else 0)
