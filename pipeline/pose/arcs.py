@@ -1,0 +1,369 @@
+"""Arcs: all images of one orbit or flyby in one graph, smoothed.
+
+An arc is a chain with one state in common, the camera's bias. It is solved segment by segment: what lies to the left
+of a segment is known to it as one Gaussian on its first pose and the bias, what lies to the right as one on its last,
+each left over when all other unknowns there are eliminated. So memory is that of one segment, and the answer is that of
+the whole graph.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import gtsam
+import numpy as np
+from pydantic import Field
+from scipy.stats import chi2
+
+from pipeline.options import Options
+from pipeline.pose.arc_factors import BIAS_KEY, ArcImage, ArcNoise, first_factors, fix_noise, image_factors, step_factor
+from pipeline.pose.graph import pose_key
+from pipeline.pose.records import MatchError, Pose, SourceLabel
+from pipeline.pose.se3 import SE3Utils
+from pipeline.records import BoolArray, FloatArray, Record
+
+_FIX_ROWS = 6
+
+
+class ArcOptions(Options):
+    """Uncertainties of trajectory and attitudes, and how an arc is cut."""
+
+    position_sigma_km: float = Field(10.0, gt=0, description="1 sigma of the trajectory's position at the start, km")
+    walk_km_per_sqrt_s: float = Field(0.01, gt=0, description="random walk of the trajectory's error, km per sqrt(s)")
+    attitude_sigma_rad: float = Field(1e-4, gt=0, description="1 sigma of one believed attitude per axis, rad")
+    boresight_sigma_rad: float = Field(1e-3, gt=0, description="1 sigma of the boresight's common offset, rad")
+    twist_sigma_rad: float = Field(1e-3, gt=0, description="1 sigma of the camera's common twist, rad")
+    segment: int = Field(250, ge=2, le=100_000, description="images solved at once")
+    outlier_chance: float = Field(1e-4, gt=0, lt=0.5, description="of a good fix to be left out")
+
+    def noise(self) -> ArcNoise:
+        """The uncertainties alone."""
+        return ArcNoise(
+            self.position_sigma_km, self.walk_km_per_sqrt_s, self.attitude_sigma_rad, self.boresight_sigma_rad,
+            self.twist_sigma_rad,
+        )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class ArcResult(Record):
+    """Smoothed poses of an arc.
+
+    Attributes
+    ----------
+    image_id
+        Images in the order of time.
+    camera_from_body
+        (n, 3, 3).
+    position_km
+        (n, 3).
+    covariance
+        (n, 6, 6) of errors (x, y, z, rx, ry, rz), km and rad, body-fixed.
+    used
+        (n,) True where the image's own landmark fix holds it.
+    label
+        What holds each pose.
+    anchor_age_ms
+        Time since the last anchored image; None before the first.
+    bias_rad
+        (3,) boresight about x and y, twist about z.
+    bias_covariance_rad2
+        (3, 3).
+    """
+
+    image_id: tuple[str, ...]
+    camera_from_body: FloatArray
+    position_km: FloatArray
+    covariance: FloatArray
+    used: BoolArray
+    label: tuple[SourceLabel, ...]
+    anchor_age_ms: tuple[int | None, ...]
+    bias_rad: FloatArray
+    bias_covariance_rad2: FloatArray
+
+    def __post_init__(self) -> None:
+        n = len(self.image_id)
+        self._freeze(
+            camera_from_body=(n, 3, 3), position_km=(n, 3), covariance=(n, 6, 6), used=(n,), bias_rad=(3,),
+            bias_covariance_rad2=(3, 3),
+        )  # fmt: skip
+
+    def pose(self, index: int) -> Pose:
+        """Pose of one image."""
+        return Pose(self.camera_from_body[index], self.position_km[index])
+
+
+def check_arc(images: Sequence[ArcImage]) -> None:
+    """Refuse arcs that are none.
+
+    Parameters
+    ----------
+    images
+        In the order of time.
+
+    Raises
+    ------
+    MatchError
+        If there are no images, one comes twice, or times do not ascend.
+    """
+    if not images:
+        raise MatchError("an arc without images")
+    if len({image.image_id for image in images}) < len(images):
+        raise MatchError("an arc with an image twice")
+    for one, other in pairwise(images):
+        if not other.et > one.et:
+            raise MatchError(f"{other.image_id} is not later than {one.image_id}")
+
+
+def smooth_arc(images: Sequence[ArcImage], options: ArcOptions | None = None) -> ArcResult:
+    """Smooth an arc in segments.
+
+    Parameters
+    ----------
+    images
+        In the order of time.
+    options
+        Uncertainties.
+
+    Returns
+    -------
+    ArcResult
+        Poses of all images, those without a fix of their own among them.
+
+    Raises
+    ------
+    MatchError
+        If the arc is none.
+    """
+    check_arc(images)
+    o = options or ArcOptions()
+    starts = list(range(0, len(images), o.segment))
+    segments = [_Segment(k, min(k + o.segment, len(images)), images, o) for k in starts]
+    # Forward: which fixes hold, and what each segment hands on to its right.
+    used = np.zeros(len(images), dtype=bool)
+    lefts = [_Handed(first_factors(images[0], o.noise()), gtsam.Values())]
+    points: list[gtsam.Values] = []
+    for segment in segments:
+        values = segment.settle(lefts[-1], used)
+        points.append(values)
+        if segment.stop < len(images):
+            lefts.append(segment.hand_on(lefts[-1], values, used, segment.stop - 1))
+    # Backward: what each segment hands on to its left, and its own answer between the two.
+    right = _Handed(gtsam.NonlinearFactorGraph(), gtsam.Values())
+    parts = []
+    for segment, left, values in zip(segments[::-1], lefts[::-1], points[::-1], strict=True):
+        parts.append(segment.answer(left, right, values, used))
+        if segment.start:
+            right = segment.hand_on(right, values, used, segment.start - 1, leftward=True)
+    return _result(images, parts[::-1], used)
+
+
+@dataclass(frozen=True)
+class _Handed:
+    """What is known beyond a segment: factors, and the values at which they were linearised (none: a prior)."""
+
+    graph: gtsam.NonlinearFactorGraph
+    at: gtsam.Values
+
+
+@dataclass(frozen=True)
+class _Part:
+    """Poses of one segment."""
+
+    turns: list[FloatArray]
+    places: list[FloatArray]
+    covariances: list[FloatArray]
+    bias: FloatArray
+    bias_covariance: FloatArray
+
+
+@dataclass(frozen=True)
+class _Segment:
+    """Images start to stop of an arc; with the last of the segment before, where the step into it begins."""
+
+    start: int
+    stop: int
+    images: Sequence[ArcImage]
+    options: ArcOptions
+
+    def graph(self, used: BoolArray, robust: gtsam.noiseModel.mEstimator.Base | None) -> gtsam.NonlinearFactorGraph:
+        """Factors of the images and of the steps into them; without a weight function, only fixes that are used."""
+        noise, graph = self.options.noise(), gtsam.NonlinearFactorGraph()
+        for k in range(self.start, self.stop):
+            image = self.images[k]
+            if robust is None and not used[k]:
+                image = replace(image, fix=None)
+            graph.push_back(image_factors(k, image, noise, robust))
+            if k:
+                graph.add(step_factor(k - 1, self.images[k - 1], self.images[k], noise))
+        return graph
+
+    def settle(self, left: _Handed, used: BoolArray) -> gtsam.Values:
+        """Solve with what lies to the left, robustly; sets ``used`` for the segment's images."""
+        values = gtsam.Values()
+        values.insert(BIAS_KEY, np.zeros(3))
+        for k in range(max(self.start - 1, 0), self.stop):
+            values.insert(pose_key(k), SE3Utils.to_gtsam(self.images[k].prior))
+        values.update(left.at)
+        gate = float(np.sqrt(chi2.isf(self.options.outlier_chance, _FIX_ROWS)))
+        # A convex weight first, so that all measurements speak; then those within the gate alone.
+        weights = gtsam.noiseModel.mEstimator
+        for weight in (weights.Huber.Create(gate / 2.0), weights.TruncatedLeastSquares.Create(gate)):
+            graph = self.graph(used, weight)
+            graph.push_back(left.graph)
+            values = _optimize(graph, values)
+        for k in range(self.start, self.stop):
+            used[k] = _distance(self.images[k], values.atPose3(pose_key(k))) <= gate
+        graph = self.graph(used, None)
+        graph.push_back(left.graph)
+        return _optimize(graph, values)
+
+    def hand_on(
+        self, beyond: _Handed, values: gtsam.Values, used: BoolArray, keep: int, leftward: bool = False
+    ) -> _Handed:
+        """One Gaussian on a pose and the bias that says what this segment and what lies beyond it know."""
+        graph = self.graph(used, None)
+        graph.push_back(beyond.graph)
+        linear = graph.linearize(values)
+        kept = {pose_key(keep), BIAS_KEY}
+        order = range(self.stop - 1, self.start - 1, -1) if leftward else range(max(self.start - 1, 0), self.stop)
+        ordering = gtsam.Ordering()
+        for k in order:
+            if pose_key(k) not in kept:
+                ordering.push_back(pose_key(k))
+        _, rest = linear.eliminatePartialSequential(ordering)
+        at = gtsam.Values()
+        at.insert(BIAS_KEY, values.atVector(BIAS_KEY))
+        at.insert(pose_key(keep), values.atPose3(pose_key(keep)))
+        handed = gtsam.NonlinearFactorGraph()
+        for i in range(rest.size()):
+            handed.add(gtsam.LinearContainerFactor(rest.at(i), at))
+        return _Handed(handed, at)
+
+    def answer(self, left: _Handed, right: _Handed, values: gtsam.Values, used: BoolArray) -> _Part:
+        """Poses and covariances between what lies to the left and to the right."""
+        graph = self.graph(used, None)
+        graph.push_back(left.graph)
+        graph.push_back(right.graph)
+        values = _optimize(graph, values)
+        marginals = gtsam.Marginals(graph, values)
+        part = _Part([], [], [], values.atVector(BIAS_KEY), marginals.marginalCovariance(BIAS_KEY))
+        for k in range(self.start, self.stop):
+            pose = SE3Utils.from_gtsam(values.atPose3(pose_key(k)))
+            covariance = marginals.marginalCovariance(pose_key(k))
+            part.turns.append(pose.camera_from_body)
+            part.places.append(pose.position_km)
+            part.covariances.append(SE3Utils.error_from_gtsam(covariance, pose.camera_from_body))
+        return part
+
+
+def _optimize(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.Values:
+    params = gtsam.LevenbergMarquardtParams()
+    params.setRelativeErrorTol(1e-8)
+    params.setMaxIterations(30)
+    return gtsam.LevenbergMarquardtOptimizer(graph, values, params).optimize()
+
+
+def _distance(image: ArcImage, pose: gtsam.Pose3) -> float:
+    """Sigmas between an image's fix and its pose; infinite without a fix."""
+    if image.fix is None:
+        return float(np.inf)
+    away = SE3Utils.to_gtsam(image.fix.pose).localCoordinates(pose)
+    return float(np.linalg.norm(fix_noise(image.fix).whiten(away)))
+
+
+def _result(images: Sequence[ArcImage], parts: list[_Part], used: BoolArray) -> ArcResult:
+    label, age = labels_of([image.et for image in images], used)
+    return ArcResult(
+        tuple(image.image_id for image in images), np.array([t for p in parts for t in p.turns]),
+        np.array([x for p in parts for x in p.places]), np.array([c for p in parts for c in p.covariances]), used,
+        label, age, parts[0].bias, parts[0].bias_covariance,
+    )  # fmt: skip
+
+
+def labels_of(et: Sequence[float], used: BoolArray) -> tuple[tuple[SourceLabel, ...], tuple[int | None, ...]]:
+    """What holds each image of an arc, and since when it was last held by its own points.
+
+    Parameters
+    ----------
+    et
+        (n,) seconds, ascending.
+    used
+        (n,) True where an image is anchored.
+
+    Returns
+    -------
+    tuple
+        Labels; ages in milliseconds, None before the first anchored image.
+    """
+    unfixed = SourceLabel.VISUAL_PROPAGATED if used.any() else SourceLabel.DEAD_RECKONED
+    labels, ages, last = [], [], None
+    for time, anchored in zip(et, used, strict=True):
+        last = time if anchored else last
+        labels.append(SourceLabel.SATELLITE_ANCHORED if anchored else unfixed)
+        ages.append(None if last is None else round((time - last) * 1e3))
+    return tuple(labels), tuple(ages)
+
+
+class GrowingArc:
+    """An arc that grows by one image at a time, on iSAM2: filtered now, smoothed as far as it goes.
+
+    Parameters
+    ----------
+    options
+        Uncertainties; ``segment`` plays no part.
+    """
+
+    def __init__(self, options: ArcOptions | None = None) -> None:
+        self.options = options or ArcOptions()
+        parameters = gtsam.ISAM2Params()
+        parameters.setRelinearizeThreshold(0.01)
+        self.isam = gtsam.ISAM2(parameters)
+        self._images: list[ArcImage] = []
+
+    def add(self, image: ArcImage) -> None:
+        """Append an image, later than all before.
+
+        Parameters
+        ----------
+        image
+            The image.
+
+        Raises
+        ------
+        MatchError
+            If it is not later.
+        """
+        check_arc([*self._images[-1:], image])
+        index, noise = len(self._images), self.options.noise()
+        gate = float(np.sqrt(chi2.isf(self.options.outlier_chance, _FIX_ROWS)))
+        huber = gtsam.noiseModel.mEstimator.Huber.Create(gate / 2.0)
+        graph, values = image_factors(index, image, noise, huber), gtsam.Values()
+        start = image.prior
+        if index:
+            graph.add(step_factor(index - 1, self._images[-1], image, noise))
+            before = self.pose(index - 1).position_km - self._images[-1].prior.position_km
+            start = Pose(start.camera_from_body, start.position_km + before)
+        else:
+            graph.push_back(first_factors(image, noise))
+            values.insert(BIAS_KEY, np.zeros(3))
+        values.insert(pose_key(index), SE3Utils.to_gtsam(start))
+        self.isam.update(graph, values)
+        self.isam.update()
+        self._images.append(image)
+
+    def pose(self, index: int) -> Pose:
+        """Present pose of one image."""
+        return SE3Utils.from_gtsam(self.isam.calculateEstimatePose3(pose_key(index)))
+
+    def covariance(self, index: int) -> FloatArray:
+        """(6, 6) covariance of its errors."""
+        marginal = self.isam.marginalCovariance(pose_key(index))
+        return SE3Utils.error_from_gtsam(marginal, self.pose(index).camera_from_body)
+
+    def bias(self) -> FloatArray:
+        """(3,) common bias, rad."""
+        return np.asarray(self.isam.calculateEstimateVector(BIAS_KEY))
+
+    def images(self) -> Iterator[ArcImage]:
+        """Images so far."""
+        return iter(self._images)

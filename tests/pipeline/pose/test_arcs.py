@@ -1,0 +1,149 @@
+"""Arcs with planted drift, bias, gaps and outliers: covariances hold, and cutting an arc changes nothing."""
+
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from pipeline.pose.arc_factors import BIAS_KEY, ArcImage, AttitudeFix, attitude_factor, step_factor
+from pipeline.pose.arcs import ArcOptions, ArcResult, GrowingArc, labels_of, smooth_arc
+from pipeline.pose.graph import pose_key, resection_factor
+from pipeline.pose.records import MatchError, Pose, SourceLabel
+from pipeline.pose.se3 import SE3Utils
+from tests.pipeline.pose.arc_scenes import plant_arc
+
+OPTIONS = ArcOptions(segment=40)
+
+
+def _errors(result: ArcResult, poses: list[Pose]) -> np.ndarray:
+    return np.array([SE3Utils.error(result.pose(k), pose) for k, pose in enumerate(poses)])
+
+
+def _nees(result: ArcResult, poses: list[Pose]) -> np.ndarray:
+    error = _errors(result, poses)
+    return np.asarray(np.einsum("ni,nij,nj->n", error, np.linalg.inv(result.covariance), error))
+
+
+def _wild(image: ArcImage, pose: Pose) -> bool:
+    if image.fix is None:
+        return False
+    error = SE3Utils.error(image.fix.pose, pose)
+    return bool(error @ np.linalg.solve(image.fix.covariance, error) > 200)
+
+
+def _numerical(factor: gtsam.CustomFactor, values: gtsam.Values) -> None:
+    """Analytic derivatives against differences along GTSAM's own retraction."""
+    linear = factor.linearize(values).jacobian()[0]
+    step, column = 1e-6, 0
+    for key in list(factor.keys()):
+        size = 3 if key == BIAS_KEY else 6
+        for k in range(size):
+            sides = []
+            for sign in (1.0, -1.0):
+                delta = gtsam.VectorValues()
+                delta.insert(key, sign * step * np.eye(size)[k])
+                sides.append(factor.unwhitenedError(values.retract(delta)))
+            slope = factor.noiseModel().whiten((sides[0] - sides[1]) / (2 * step))
+            assert_allclose(linear[:, column], slope, rtol=1e-4, atol=1e-5 * np.abs(linear).max())
+            column += 1
+
+
+def test_derivatives_of_the_factors() -> None:
+    images, poses, _ = plant_arc(3, 0, OPTIONS)
+    values = gtsam.Values()
+    values.insert(BIAS_KEY, np.array([1e-3, -2e-3, 3e-3]))
+    for k, pose in enumerate(poses):
+        values.insert(pose_key(k), SE3Utils.to_gtsam(pose).retract(np.full(6, 1e-3)))
+    _numerical(attitude_factor(1, images[1], OPTIONS.noise()), values)
+    _numerical(step_factor(1, images[1], images[2], OPTIONS.noise()), values)
+    points = np.random.default_rng(0).normal(size=(5, 3)) * 50
+    camera = poses[0].to_camera(points)
+    factor = resection_factor(pose_key(0), points, camera[:, :2] / camera[:, 2:], np.tile(np.eye(2) * 1e-8, (5, 1, 1)))
+    _numerical(factor, values)
+
+
+def test_covariances_hold_with_and_without_a_fix_of_ones_own() -> None:
+    nees, alone, biases = [], [], []
+    for seed in range(12):
+        images, poses, bias = plant_arc(60, seed, OPTIONS)
+        result = smooth_arc(images, OPTIONS)
+        each = _nees(result, poses)
+        nees.append(each.mean())
+        alone.append(each[~result.used].mean())
+        away = result.bias_rad - bias
+        biases.append(away @ np.linalg.solve(result.bias_covariance_rad2, away))
+        bad = [_wild(image, pose) for image, pose in zip(images, poses, strict=True)]
+        assert not (result.used & np.array(bad)).any()
+        assert result.used.sum() > 0.9 * (sum(im.fix is not None for im in images) - sum(bad))
+    # Neighbours share errors, so an arc's mean of 60 scatters by about a half.
+    assert 5.3 < np.mean(nees) < 6.7
+    assert 5.2 < np.mean(alone) < 6.8
+    assert 1.0 < np.mean(biases) < 5.5
+
+
+def test_cutting_an_arc_changes_nothing() -> None:
+    images, _, _ = plant_arc(100, 20, OPTIONS)
+    cut, whole = smooth_arc(images, ArcOptions(segment=13)), smooth_arc(images, ArcOptions(segment=1000))
+    assert (cut.used == whole.used).all()
+    sigma = np.sqrt(np.diagonal(whole.covariance, axis1=1, axis2=2))
+    assert (np.abs(cut.position_km - whole.position_km) < 1e-3 * sigma[:, :3]).all()
+    assert_allclose(np.sqrt(np.diagonal(cut.covariance, axis1=1, axis2=2)), sigma, rtol=1e-3)
+    assert_allclose(cut.bias_rad, whole.bias_rad, atol=1e-9)
+
+
+def test_a_growing_arc_arrives_where_the_whole_one_does() -> None:
+    images, poses, _ = plant_arc(60, 21, OPTIONS, outliers=0.0)
+    growing = GrowingArc(OPTIONS)
+    for image in images:
+        growing.add(image)
+    whole = smooth_arc(images, OPTIONS)
+    sigma = np.sqrt(np.diag(whole.covariance[-1]))
+    assert (np.abs(SE3Utils.error(growing.pose(59), whole.pose(59))) < 0.3 * sigma).all()
+    assert_allclose(np.sqrt(np.diag(growing.covariance(59))), sigma, rtol=0.2)
+    assert_allclose(growing.bias(), whole.bias_rad, atol=1e-5)
+    assert len(list(growing.images())) == 60
+    with pytest.raises(MatchError, match="not later"):
+        growing.add(replace(images[3], image_id="late"))
+    assert poses
+
+
+def test_an_arc_without_fixes_is_dead_reckoned_within_its_priors() -> None:
+    images, poses, _ = plant_arc(30, 22, OPTIONS, gap=1.0)
+    result = smooth_arc(images, OPTIONS)
+    assert set(result.label) == {SourceLabel.DEAD_RECKONED}
+    assert set(result.anchor_age_ms) == {None}
+    assert_allclose(np.sqrt(np.diag(result.covariance[0])[:3]), OPTIONS.position_sigma_km, rtol=1e-3)
+    assert 0.5 < _nees(result, poses).mean() < 15
+
+
+def test_attitude_fixes_show_the_bias_without_a_position() -> None:
+    images, poses, bias = plant_arc(40, 23, OPTIONS, gap=1.0)
+    rng = np.random.default_rng(1)
+    measured = []
+    for image, pose in zip(images, poses, strict=True):
+        r = rng.normal(size=3) * 2e-5
+        turn = pose.camera_from_body @ SE3Utils.exp(r)
+        measured.append(replace(image, attitude_fix=AttitudeFix(turn, np.eye(3) * 4e-10)))
+    result = smooth_arc(measured, OPTIONS)
+    away = result.bias_rad - bias
+    assert np.sqrt(away @ np.linalg.solve(result.bias_covariance_rad2, away)) < 4.5
+    assert np.linalg.norm(away) < 0.1 * np.linalg.norm(bias)
+
+
+def test_labels_and_ages() -> None:
+    labels, ages = labels_of([0.0, 1.5, 2.0, 4.25], np.array([False, True, False, False]))
+    assert [label.value for label in labels] == ["visual_propagated", "satellite_anchored", *["visual_propagated"] * 2]
+    assert ages == (None, 0, 500, 2750)
+
+
+def test_what_is_no_arc_is_refused() -> None:
+    images, _, _ = plant_arc(3, 24, OPTIONS)
+    for wrong, message in (
+        ([], "without images"), ([images[0], images[0]], "twice"), ([images[1], images[0]], "not later"),
+    ):  # fmt: skip
+        with pytest.raises(MatchError, match=message):
+            smooth_arc(wrong)
+    with pytest.raises(MatchError, match="no time"):
+        replace(images[0], et=np.nan)
