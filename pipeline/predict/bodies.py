@@ -103,8 +103,10 @@ class BodyScene:
         Geometry.
     reach_vu
         Farthest that a body can be from its prediction, whole pixels: the search margin and what a rotation adds.
+    told_sigma_px
+        Core of the point spread as the camera's record tells it.
     sigma_px
-        Core of the point spread.
+        The one that templates are drawn with: the image may show another.
     views
         Under the a-priori attitude, farthest first.
     fates
@@ -117,6 +119,7 @@ class BodyScene:
 
     state: State
     reach_vu: tuple[int, int]
+    told_sigma_px: float
     sigma_px: float
     views: tuple[BodyView, ...]
     fates: tuple[BodyFate, ...]
@@ -364,7 +367,7 @@ def predict_bodies(state: State, sigma_px: float, options: BodyPredictionOptions
     views.sort(key=lambda view: -float(np.linalg.norm(view.centre_km)))
     canvas = canvas.grown(_CANVAS_SKY_PX, _CANVAS_SKY_PX)
     rays = ray_grid(state.camera_model, canvas) if views else None
-    return BodyScene(state, reach, sigma_px, tuple(views), tuple(fates), canvas, rays)
+    return BodyScene(state, reach, sigma_px, sigma_px, tuple(views), tuple(fates), canvas, rays)
 
 
 def _hides_any(dark: BodyView, views: list[BodyView]) -> bool:

@@ -36,7 +36,7 @@ from pipeline.techniques.body_base import (
 from pipeline.techniques.contour_fit import BandOptions, Segments, measure_segments
 from pipeline.techniques.line_search import LinePlace, search_line
 from pipeline.techniques.lm import lm_subpixel_refine
-from pipeline.techniques.model_errors import ModelErrorOptions, assumed_errors
+from pipeline.techniques.model_errors import ModelErrorOptions, assumed_errors, haze_px
 from pipeline.techniques.relief import Field_, ReliefFit, ReliefOptions, fit_relief
 from pipeline.techniques.template_fit import TemplateFit
 
@@ -131,7 +131,7 @@ def body_limb_nav(
     if isinstance(start, str):
         return TechniqueFailure(LIMB, StatusReason.NO_FEATURES_DETECTED, start)
     start = _same_basin(start, fix, scene, context)
-    fields = {k: _limb_field(view, options.relief_share) for k, view in enumerate(scene.views)}
+    fields = {k: _limb_field(scene, view, options) for k, view in enumerate(scene.views)}
     # Of a small body the band is to hold the limb, not all of it.
     radius = scene.primary(scene.views).diameter_px / 2
     width = float(np.clip(options.band_share * radius, 2.0, options.band.half_width_px))
@@ -182,12 +182,12 @@ def body_terminator_nav(
     return _result(TERMINATOR, "terminator", fit, start, scene, context, options, options.min_shown_share)
 
 
-def _limb_field(view: BodyView, relief_share: float) -> Field_:
+def _limb_field(scene: BodyScene, view: BodyView, options: BodyLimbOptions) -> Field_:
     """Relief of a body: the catalogue's, else a share of its radius; the radius is known as well as that."""
     sigma = view.body.shape_sigma_km
-    rms = relief_share * view.diameter_px / 2 if sigma is None else sigma * view.px_per_km
+    rms = options.relief_share * view.diameter_px / 2 if sigma is None else sigma * view.px_per_km
     rms = max(rms, 1e-3)
-    return Field_(rms, view.body.shape_correlation_deg, sigma is not None, rms)
+    return Field_(rms, view.body.shape_correlation_deg, sigma is not None, rms, haze_px(scene, view, options.errors))
 
 
 def _find_limb(scene: BodyScene, frame: Frame, context: NavContext, options: BodyLimbOptions) -> _Start | str:

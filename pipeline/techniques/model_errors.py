@@ -13,9 +13,12 @@ import numpy as np
 from pydantic import Field
 
 from pipeline.options import Options
+from pipeline.predict.bodies import BodyScene
 from pipeline.predict.body_view import BodyView
 from pipeline.records import BoolArray, FloatArray, Image
 
+# Share of the point spread's variance by which a camera's core may be wider than its record tells.
+_WIDER_SHARE = 0.5
 # Correlated errors are summed on blocks of about a quarter of their reach.
 _BLOCKS_PER_REACH = 4.0
 # Median of the square of a standard normal variable.
@@ -34,6 +37,30 @@ class ModelErrorOptions(Options):
     wide_share: float = Field(0.7, ge=0, le=2, description="rms of albedo of wide reach, relative to all of it")
     wide_reach: float = Field(0.6, gt=0, le=3, description="that reach, radii")
     relief_share: float = Field(2e-3, ge=0, le=0.2, description="relief over radius where no catalogue tells it")
+
+
+def haze_px(scene: BodyScene, view: BodyView, options: ModelErrorOptions) -> float:
+    """How far a haze may have moved the limb outward: edges softer than the optics and the relief can make them.
+
+    A haze of scale height H adds about H^2 to the variance of the edge, and H to its place.
+
+    Parameters
+    ----------
+    scene
+        Bodies, through the point spread that the image shows.
+    view
+        The body.
+    options
+        Assumptions.
+
+    Returns
+    -------
+    float
+        1 sigma of a height that its whole limb shares, pixels.
+    """
+    relief = assumed_errors(view, options).relief_px
+    explained = (1.0 + _WIDER_SHARE) * scene.told_sigma_px**2 + relief**2
+    return float(np.sqrt(max(scene.sigma_px**2 - explained, 0.0)))
 
 
 @dataclass(frozen=True)

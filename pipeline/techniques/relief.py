@@ -54,12 +54,15 @@ class Field_(Record):
         Whether a catalogue says so.
     common_px
         1 sigma of a height that the whole outline shares.
+    haze_px
+        1 sigma of a height that a good part of the outline shares, as a haze lends it to where the Sun is high.
     """
 
     rms_px: float
     reach_deg: float
     known: bool
     common_px: float
+    haze_px: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,15 +126,15 @@ def fit_relief(
     if lever is not None:
         design = np.column_stack([design, (segments.normal_vu * lever).sum(axis=1)])
     bodies = sorted(set(segments.body.tolist()))
-    near, far = _correlations(segments, fields)
-    albedo = _albedo(segments)
+    near, far, haze = _correlations(segments, fields)
+    fixed = _albedo(segments) + haze
     span = float(np.degrees(np.arccos(np.clip((segments.direction @ segments.direction.T).min(), -1.0, 1.0))))
     common = {b: fields[b].common_px for b in bodies}
     weight = np.ones(len(segments))
     short, long_ = 1.0, 0.0
     for _ in range(_ROUNDS):
         noise = segments.sigma_px**2 / np.maximum(weight, _LEAST_WEIGHT)
-        base = np.diag(noise) + _common(segments, common) + albedo
+        base = np.diag(noise) + _common(segments, common) + fixed
         short, long_ = _likeliest(segments.shift_px, design, base, near, far, (short, long_), fields, span, options)
         covariance = base + short**2 * near + long_**2 * far
         step, information, solved = _solve(segments.shift_px, design, covariance)
@@ -150,14 +153,15 @@ def fit_relief(
     return ReliefFit(step, information, residual, weight, rms, long_px, heights, chi2)
 
 
-def _correlations(segments: Segments, fields: dict[int, Field_]) -> tuple[FloatArray, FloatArray]:
-    """Covariances of relief and of a wrong shape, both for factor one."""
+def _correlations(segments: Segments, fields: dict[int, Field_]) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Covariances of relief and of a wrong shape, both for factor one, and of a haze."""
     angle = np.arccos(np.clip(segments.direction @ segments.direction.T, -1.0, 1.0))
     rms = np.array([fields[b].rms_px for b in segments.body.tolist()])
     reach = np.radians([fields[b].reach_deg for b in segments.body.tolist()])
     same = segments.body[:, None] == segments.body[None, :]
-    scale = np.where(same, np.outer(rms, rms), 0.0)
-    return scale * np.exp(-angle / reach[:, None]), scale * np.exp(-angle / np.radians(_LONG_REACH_DEG))
+    haze = np.array([fields[b].haze_px for b in segments.body.tolist()])
+    scale, wide = np.where(same, np.outer(rms, rms), 0.0), np.exp(-angle / np.radians(_LONG_REACH_DEG))
+    return scale * np.exp(-angle / reach[:, None]), scale * wide, np.where(same, np.outer(haze, haze), 0.0) * wide
 
 
 def _albedo(segments: Segments) -> FloatArray:

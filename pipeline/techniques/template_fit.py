@@ -29,6 +29,7 @@ from pipeline.techniques.model_errors import (
     ModelErrors,
     assumed_errors,
     correlated_sums,
+    haze_px,
     measured_errors,
 )
 
@@ -46,6 +47,8 @@ _STEEP = 0.08
 _NIGHT_SHARE, _SKY_SLOPE_SHARE, _WIDTH_SHARE = 0.02, 0.02, 0.5
 _LEAST_VARIANCE_PX2 = 0.04
 _PROVINCE_RADII = 1.2
+# Without a sign of a haze the limb stays where it is.
+_LEAST_HAZE_PX = 1e-4
 # What is left of albedo of wide reach once its rise across the body is fitted.
 _LEFT_OVER = 0.5
 
@@ -117,7 +120,8 @@ class _Samples:
 
 @dataclass(frozen=True, eq=False)
 class _Solution:
-    """One weighted linear solution: changes of (dv, du[, theta], brightness, night, width, sky, its slopes, albedo's).
+    """One weighted linear solution: changes of (dv, du[, theta], brightness, night, width, sky, its slopes, albedo's
+    two, height of a haze).
 
     ``lever`` is (2,), the offset that goes with a rotation which the image does not show apart from it; None where it
     does, or where no rotation is fitted.
@@ -160,11 +164,12 @@ def fit_template(
         Or why there is none.
     """
     state = _State(np.asarray(start_vu, float), start_rad, None, None)
+    haze = haze_px(scene, scene.primary(scene.views), options)
     for _ in range(_ROUNDS):
         cutout = cut_out(scene, frame, state.offset_vu, state.rotation_rad)
         if cutout is None or np.count_nonzero(cutout.good) < _FEWEST_PIXELS:
             return "too few pixels"
-        last, outcome = state.offset_vu, _round(cutout, frame.noise, state, context, options)
+        last, outcome = state.offset_vu, _round(cutout, frame.noise, state, haze, context, options)
         if isinstance(outcome, str):
             return outcome
         fitted, state = outcome, outcome.state
@@ -198,7 +203,7 @@ class _Round:
 
 
 def _round(
-    cutout: Cutout, noise: PixelNoise, state: _State, context: NavContext, options: ModelErrorOptions
+    cutout: Cutout, noise: PixelNoise, state: _State, haze: float, context: NavContext, options: ModelErrorOptions
 ) -> _Round | str:
     """Solve on one template, renew the errors, and step."""
     levels = state.levels or rough_levels(cutout)
@@ -206,7 +211,7 @@ def _round(
     if not levels.scale > 0:
         return "the image is not bright where the template is"
     samples = _sample(cutout)
-    solution = _solve(samples, cutout, noise, levels, errors, context)
+    solution = _solve(samples, cutout, noise, levels, errors, haze, context)
     k, values = solution.size, solution.values
     levels = Levels(levels.scale + values[k], levels.sky + values[k + 3], levels.night + values[k + 1])
     if not np.isfinite(values).all() or not levels.scale > 0:
@@ -284,7 +289,10 @@ def _design(samples: _Samples, cutout: Cutout, pivot_vu: FloatArray, scale: floa
     arm_v, arm_u = (2.0 * (x - c) / largest.diameter_px for x, c in zip((v, u), largest.centre_vu, strict=True))
     near = np.hypot(arm_v, arm_u) < _PROVINCE_RADII
     provinces = (np.where(near, image * arm_v, 0.0), np.where(near, image * arm_u, 0.0))
-    return np.stack([*columns, image, night, scale * widening, one, slope_v, slope_u, *provinces], axis=1)
+    # A haze lifts the limb all around.
+    length = np.maximum(np.hypot(arm_v, arm_u), 1e-6)
+    growth = np.where(near, -scale * (along_v * arm_v + along_u * arm_u) / length, 0.0)
+    return np.stack([*columns, image, night, scale * widening, one, slope_v, slope_u, *provinces, growth], axis=1)
 
 
 def _centres(cutout: Cutout, v: FloatArray, u: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -301,6 +309,7 @@ def _solve(
     noise: PixelNoise,
     levels: Levels,
     errors: ModelErrors,
+    haze: float,
     context: NavContext,
 ) -> _Solution:
     turns = context.fit_camera_rotation
@@ -314,7 +323,8 @@ def _solve(
     pull = weighted.T @ target
     sigma2 = max(float(cutout.sigma_px) ** 2, _LEAST_VARIANCE_PX2)
     prior = np.zeros(len(gram))
-    prior[size + 6 :] = 1.0 / max(errors.wide_texture * levels.scale, 1e-30) ** 2
+    prior[size + 8] = 1.0 / max(haze, _LEAST_HAZE_PX) ** 2
+    prior[size + 6 : size + 8] = 1.0 / max(errors.wide_texture * levels.scale, 1e-30) ** 2
     prior[size + 1] = 1.0 / (_NIGHT_SHARE * levels.scale) ** 2
     prior[size + 2] = 1.0 / (_WIDTH_SHARE * sigma2) ** 2
     prior[size + 4 : size + 6] = 1.0 / (_SKY_SLOPE_SHARE * levels.scale) ** 2
