@@ -25,7 +25,7 @@ class RingMode(Options):
     pattern_speed_deg_day: float = Field(0.0, description="motion of the pattern (of the phase if m = 0), deg/day")
 
     def at(self, days: float, shift_deg: float = 0.0) -> tuple[float, float, float]:
-        """m, amplitude in km and phase in radians, some days after the epoch; longitudes are shifted, phases are not."""
+        """m, amplitude in km and phase in radians, days after the epoch; longitudes are shifted, phases are not."""
         shift = 0.0 if self.m == 0 else shift_deg
         angle = np.radians((self.longitude_deg + shift + self.pattern_speed_deg_day * days) % 360.0)
         return float(self.m), self.amplitude_km, float(angle if self.m == 0 else self.m * angle)

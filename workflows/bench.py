@@ -26,6 +26,7 @@ from workflows.bench_scenes import (
     make_disc_turned,
     make_lorri_256,
     make_moons_and_stars,
+    make_ring_1024,
     make_stars_1024,
 )
 from workflows.config import load_configuration
@@ -53,6 +54,7 @@ class Figures:
 CASES: dict[str, Callable[[Path], Path]] = {
     "stars_1024": make_stars_1024, "lorri_256": make_lorri_256, "disc_1024": make_disc_1024,
     "moons_stars": make_moons_and_stars, "disc_turned": make_disc_turned,
+    "ring_1024": make_ring_1024,
 }  # fmt: skip
 
 

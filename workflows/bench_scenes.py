@@ -16,6 +16,9 @@ _PLANTED_VU = np.array([21.3, -77.6])
 _SUN = np.array([0.45, -0.35, -0.822])
 _SUPERSAMPLES = 4
 _RANGE_KM = 1.0e6
+# Sine of the opening of the benchmark's ring, and its plane: the pole leans back by the opening from +Z of J2000.
+_RING_SINE = 0.5
+_RING_PLANE_WXYZ = [0.6830127018922193, 0.1830127018922193, 0.1830127018922193, -0.6830127018922193]
 
 
 def make_stars_1024(folder: Path) -> Path:
@@ -112,6 +115,44 @@ def make_moons_and_stars(folder: Path) -> Path:
     return _write(folder, "moons_stars", light, (catalogue, flux), discs, turns=False)
 
 
+def make_ring_1024(folder: Path) -> Path:
+    """Archive of one 1024 x 1024 frame with an inclined eccentric ringlet, margins 50 x 140.
+
+    Parameters
+    ----------
+    folder
+        New folder.
+
+    Returns
+    -------
+    pathlib.Path
+        Its archive.yaml.
+    """
+    rings: dict[str, object] = {
+        "planet": "ALPHA", "position_km": [_RANGE_KM, 0.0, 0.0],
+        "plane_from_j2000_wxyz": _RING_PLANE_WXYZ, "opening_sun_deg": 40.0,
+        "features": [{
+            "name": "R1", "kind": "ringlet", "a_km": 380.0 / _PX_PER_RAD * _RANGE_KM, "ae_km": 0.0,
+            "long_peri_deg": 0.0, "width_km": 24.0 / _PX_PER_RAD * _RANGE_KM, "tau": 1.0, "sigma_a_km": 0.1,
+            "modes": [],
+        }],
+    }  # fmt: skip
+    return _write(folder, "ring_1024", _ringlet(380.0, 24.0), None, [], turns=False, rings=rings)
+
+
+def _ringlet(inner: float, width: float) -> np.ndarray:
+    """Light of a circular ringlet around the array's centre, its plane 30 degrees from the line of sight."""
+    light = np.zeros((_SIDE, _SIDE))
+    fine = (np.arange(_SIDE * _SUPERSAMPLES) + 0.5) / _SUPERSAMPLES - 0.5 - 511.5
+    v, u = (fine[:, None] - _PLANTED_VU[0]) / _PX_PER_RAD, (fine - _PLANTED_VU[1]) / _PX_PER_RAD
+    # The ray (1, u, v) meets the plane through the planet at this share of the planet's range.
+    share = _RING_SINE / (_RING_SINE - np.sqrt(1.0 - _RING_SINE**2) * v)
+    radius = _PX_PER_RAD * np.sqrt((share - 1.0) ** 2 + (share * v) ** 2 + (share * u) ** 2)
+    lit = ((radius >= inner) & (radius < inner + width)).astype(float)
+    light += 300.0 * lit.reshape(_SIDE, _SUPERSAMPLES, _SIDE, _SUPERSAMPLES).mean(axis=(1, 3))
+    return light
+
+
 def _stars(places_vu: np.ndarray, flux_dn: np.ndarray) -> np.ndarray:
     """Light of Gaussian stars."""
     light = np.zeros((_SIDE, _SIDE))
@@ -146,6 +187,7 @@ def _write(
     stars: tuple[np.ndarray, np.ndarray] | None,
     discs: list[tuple[np.ndarray, float, str]],
     turns: bool,
+    rings: dict[str, object] | None = None,
 ) -> Path:
     """Frame, sidecar, star table and archive.yaml; the camera's x, y, z are +Y, +Z, +X of J2000."""
     frames = folder / "frames"
@@ -154,7 +196,7 @@ def _write(
     noisy = rng.poisson((light + 20.0) * 12.0) / 12.0 + rng.normal(0.0, 4.0, light.shape)
     image = np.clip(np.rint(noisy), -32768, 4095).astype(np.int16)
     fits.PrimaryHDU(image).writeto(frames / f"{name}.fits")
-    sidecar = _sidecar(name, turns) | {"bodies": [_body(*disc) for disc in discs]}
+    sidecar = _sidecar(name, turns) | {"bodies": [_body(*disc) for disc in discs], "rings": rings}
     (frames / f"{name}.geometry.json").write_text(json.dumps(sidecar))
     if stars is not None:
         x, y = (stars[0][:, 1] - 511.5) / _PX_PER_RAD, (stars[0][:, 0] - 511.5) / _PX_PER_RAD

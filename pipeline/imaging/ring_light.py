@@ -5,7 +5,7 @@ is ``(R - r(longitude)) / |gradient|`` with one more Newton step where it decide
 of that distance; on a curved edge the blur shifts it by ``sigma^2 / (2 radius of curvature)``.
 """
 
-from math import atan2, erf, exp, floor, hypot, pi, sqrt
+from math import atan2, erf, exp, floor, pi, sqrt
 
 import numba
 import numpy as np
@@ -50,23 +50,39 @@ def look(slopes, origin, turn, observer, v, u, out):  # type: ignore[no-untyped-
 
 
 @numba.njit(cache=True, nogil=True)
-def to_edge(curve, place, found):  # type: ignore[no-untyped-def]
-    """Signed distance in pixels, unit normal (v, u) outward, and km per pixel along it."""
+def _radial(place, polar):  # type: ignore[no-untyped-def]
+    """Radius and its derivatives along v and u; returns km per pixel along the gradient."""
     x, y = place[0], place[1]
-    radius = hypot(x, y)
-    count = curve.shape[0]
+    radius = max(sqrt(x * x + y * y), 1e-9)
+    polar[0] = radius
+    polar[1] = (x * place[2] + y * place[4]) / radius
+    polar[2] = (x * place[3] + y * place[5]) / radius
+    return sqrt(polar[1] * polar[1] + polar[2] * polar[2])
+
+
+@numba.njit(cache=True, nogil=True)
+def _angular(place, count, polar):  # type: ignore[no-untyped-def]
+    """Derivatives of the longitude, and the place in a table of ``count`` longitudes; after :func:`_radial`."""
+    x, y, square = place[0], place[1], polar[0] * polar[0]
+    polar[3] = (x * place[4] - y * place[2]) / square
+    polar[4] = (x * place[5] - y * place[3]) / square
     at = atan2(y, x) / (2.0 * pi) * count
-    if at < 0:
-        at += count
-    i = int(at)
-    share = at - i
+    polar[5] = at + count if at < 0 else at
+
+
+@numba.njit(cache=True, nogil=True)
+def _to_edge(curve, polar, found):  # type: ignore[no-untyped-def]
+    """Signed distance in pixels, unit normal (v, u) outward, and km per pixel along it."""
+    count = curve.shape[0]
+    i = int(polar[5])
+    share = polar[5] - i
     i = i % count
     low, high = curve[i], curve[(i + 1) % count]
     bend = (high - low) * count / (2.0 * pi)
-    gv = (x * place[2] + y * place[4]) / radius - bend * (x * place[4] - y * place[2]) / radius**2
-    gu = (x * place[3] + y * place[5]) / radius - bend * (x * place[5] - y * place[3]) / radius**2
-    length = hypot(gv, gu)
-    found[0] = (radius - (low + share * (high - low))) / length
+    gv = polar[1] - bend * polar[3]
+    gu = polar[2] - bend * polar[4]
+    length = sqrt(gv * gv + gu * gu)
+    found[0] = (polar[0] - (low + share * (high - low))) / length
     found[1], found[2], found[3] = gv / length, gu / length, length
 
 
@@ -120,16 +136,14 @@ def profile_image(  # type: ignore[no-untyped-def]
     slopes, origin, turn, observer, first, step, curves, means, spread, contrasts, sigma, forms, sun, out,
 ):  # fmt: skip
     """Light of the rings at pixels ``first + step * (i, j)``, blurred by ``sigma`` pixels across every edge."""
-    place, found = np.zeros(15), np.zeros(4)
+    place, polar, found = np.zeros(15), np.zeros(6), np.zeros(4)
     for i in range(out.shape[0]):
         for j in range(out.shape[1]):
             out[i, j] = 0.0
             if not look(slopes, origin, turn, observer, first[0] + step * i, first[1] + step * j, place):
                 continue
-            radius = hypot(place[0], place[1])
-            scale = hypot(
-                place[0] * place[2] + place[1] * place[4], place[0] * place[3] + place[1] * place[5]
-            ) / max(radius, 1e-9)
+            scale = _radial(place, polar)
+            radius, turned = polar[0], False
             if forms.shape[0]:
                 hidden = _covered(forms, place, observer, sun)
                 if hidden == 1 or hidden == 3:
@@ -140,7 +154,10 @@ def profile_image(  # type: ignore[no-untyped-def]
                 if radius > means[k] + spread[k] + reach:
                     light += contrasts[k]
                 elif radius > means[k] - spread[k] - reach:
-                    to_edge(curves[k], place, found)
+                    if not turned:
+                        _angular(place, curves.shape[1], polar)
+                        turned = True
+                    _to_edge(curves[k], polar, found)
                     light += contrasts[k] * _normal_integral(found[0] / sigma)
             out[i, j] = light
 
@@ -150,22 +167,23 @@ def near_edges(  # type: ignore[no-untyped-def]
     slopes, origin, turn, observer, shape, curves, means, spread, reach, flat,
 ):  # fmt: skip
     """Flat indices of pixels within ``reach`` of an edge; how many. Far from all edges the walk takes long steps."""
-    place, found = np.zeros(15), np.zeros(4)
+    place, polar, found = np.zeros(15), np.zeros(6), np.zeros(4)
     count = 0
     for v in range(shape[0]):
         u = 0
         while u < shape[1]:
             nearest = 64.0
             if look(slopes, origin, turn, observer, float(v), float(u), place):
-                radius = hypot(place[0], place[1])
-                scale = hypot(
-                    place[0] * place[2] + place[1] * place[4], place[0] * place[3] + place[1] * place[5]
-                ) / max(radius, 1e-9)
+                scale = _radial(place, polar)
+                radius, turned = polar[0], False
                 for k in range(curves.shape[0]):
                     gap = (abs(radius - means[k]) - spread[k]) / scale
                     if gap < nearest:
                         if spread[k] > 0.02 * scale:
-                            to_edge(curves[k], place, found)
+                            if not turned:
+                                _angular(place, curves.shape[1], polar)
+                                turned = True
+                            _to_edge(curves[k], polar, found)
                             gap = abs(found[0])
                         if gap < nearest:
                             nearest = gap
@@ -178,18 +196,22 @@ def near_edges(  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def measure(  # type: ignore[no-untyped-def]
-    slopes, origin, turn, observer, cols, flat, curves, cell_of, span, unit_of, unit_edges, reach, sigma, forms,
-    sun, unit, distance,
+    slopes, origin, turn, observer, cols, flat, curves, means, spread, cell_of, span, unit_of, unit_edges, reach,
+    sigma, forms, sun, unit, distance,
 ):  # fmt: skip
     """Unit of each pixel (-1 for none), and its distances in pixels to all edges of the unit."""
     place, found, foot, other = np.zeros(15), np.zeros(4), np.zeros(15), np.zeros(4)
+    polar, footing = np.zeros(6), np.zeros(6)
+    count = curves.shape[1]
     bins = cell_of.shape[0]
     for n in range(flat.shape[0]):
         unit[n] = -1
         v, u = float(flat[n] // cols), float(flat[n] % cols)
         if not look(slopes, origin, turn, observer, v, u, place):
             continue
-        angle = atan2(place[1], place[0])
+        scale = _radial(place, polar)
+        _angular(place, count, polar)
+        angle = polar[5] / count * 2.0 * pi
         at = int((angle - span[0]) % (2.0 * pi) / span[1] * bins)
         cell = cell_of[at] if at < bins else -1
         if cell < 0:
@@ -198,8 +220,8 @@ def measure(  # type: ignore[no-untyped-def]
             continue
         best, nearest = -1, reach
         for k in range(curves.shape[0]):
-            if unit_of[cell, k] >= 0:
-                to_edge(curves[k], place, found)
+            if unit_of[cell, k] >= 0 and abs(polar[0] - means[k]) - spread[k] < nearest * scale * 1.1:
+                _to_edge(curves[k], polar, found)
                 if abs(found[0]) < nearest:
                     best, nearest = k, abs(found[0])
         if best < 0:
@@ -207,12 +229,14 @@ def measure(  # type: ignore[no-untyped-def]
         mine = unit_of[cell, best]
         sound = True
         for k in range(unit_edges[mine, 0], unit_edges[mine, 1]):
-            to_edge(curves[k], place, found)
+            _to_edge(curves[k], polar, found)
             s = found[0]
             if abs(s) < 2.0 * reach:
                 bend = 0.0
                 if look(slopes, origin, turn, observer, v - s * found[1], u - s * found[2], foot):
-                    to_edge(curves[k], foot, other)
+                    _radial(foot, footing)
+                    _angular(foot, count, footing)
+                    _to_edge(curves[k], footing, other)
                     s += other[0]
                     nv, nu = other[1], other[2]
                     # Curvature: how the normal turns along the edge.
@@ -220,7 +244,9 @@ def measure(  # type: ignore[no-untyped-def]
                         slopes, origin, turn, observer,
                         v - found[0] * found[1] - nu, u - found[0] * found[2] + nv, foot,
                     ):  # fmt: skip
-                        to_edge(curves[k], foot, other)
+                        _radial(foot, footing)
+                        _angular(foot, count, footing)
+                        _to_edge(curves[k], footing, other)
                         bend = -nu * (other[1] - nv) + nv * (other[2] - nu)
                 if abs(bend) * (sigma + abs(found[0])) > 0.5:
                     sound = False
@@ -373,12 +399,42 @@ def unit_equations(  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
+def assemble(gram, pull, weight, normal, lever, scale, edges, column, size, features, total, right):  # type: ignore[no-untyped-def]
+    """Add units' equations in shifts to those in offset, rotation, blur, and radii of features and edges."""
+    value, where = np.zeros((MOST_EDGES + 1, 5)), np.zeros((MOST_EDGES + 1, 5), np.int64)
+    filled = np.zeros(MOST_EDGES + 1, np.int64)
+    for n in range(edges.shape[0]):
+        if weight[n] <= 0.0:
+            continue
+        count = edges[n, 1] - edges[n, 0]
+        for k in range(count):
+            value[k, 0], where[k, 0] = normal[n, k, 0], 0
+            value[k, 1], where[k, 1] = normal[n, k, 1], 1
+            at = 2
+            if size == 3:
+                value[k, 2], where[k, 2] = lever[n, k], 2
+                at = 3
+            value[k, at], where[k, at] = scale[n, k], size + 1 + column[edges[n, 0] + k]
+            value[k, at + 1], where[k, at + 1] = scale[n, k], size + 1 + features + edges[n, 0] + k
+            filled[k] = at + 2
+        value[count, 0], where[count, 0], filled[count] = 1.0, size, 1
+        for a in range(count + 1):
+            for i in range(filled[a]):
+                right[where[a, i]] += weight[n] * value[a, i] * pull[n, a]
+                for b in range(count + 1):
+                    share = weight[n] * value[a, i] * gram[n, a, b]
+                    if share != 0.0:
+                        for j in range(filled[b]):
+                            total[where[a, i], where[b, j]] += share * value[b, j]
+
+
+@numba.njit(cache=True, nogil=True)
 def band_equations(  # type: ignore[no-untyped-def]
     slopes, origin, turn, observer, first, step, data, weight, curves, means, spread, sigma, forms, sun, gram,
     pull,
 ):  # fmt: skip
     """Normal equations of an image in level, two slopes, and the brightness outside of every edge; data's power."""
-    place, found = np.zeros(15), np.zeros(4)
+    place, polar, found = np.zeros(15), np.zeros(6), np.zeros(4)
     count = curves.shape[0]
     share, which = np.zeros(count + 4), np.zeros(count + 4, np.int64)
     rows, cols = data.shape
@@ -392,10 +448,8 @@ def band_equations(  # type: ignore[no-untyped-def]
                 continue
             if forms.shape[0] and _covered(forms, place, observer, sun) > 0:
                 continue
-            radius = hypot(place[0], place[1])
-            scale = hypot(
-                place[0] * place[2] + place[1] * place[4], place[0] * place[3] + place[1] * place[5]
-            ) / max(radius, 1e-9)
+            scale = _radial(place, polar)
+            radius, turned = polar[0], False
             reach = _FAR_SIGMAS * sigma * scale
             share[0], which[0] = 1.0, 0
             share[1], which[1] = 2.0 * i / rows - 1.0, 1
@@ -407,7 +461,10 @@ def band_equations(  # type: ignore[no-untyped-def]
                 if radius > means[k] + spread[k] + reach:
                     inside = 1.0
                 elif radius > means[k] - spread[k] - reach:
-                    to_edge(curves[k], place, found)
+                    if not turned:
+                        _angular(place, curves.shape[1], polar)
+                        turned = True
+                    _to_edge(curves[k], polar, found)
                     inside = _normal_integral(found[0] / sigma)
                 # Band k - 1 lies between the edges k - 1 and k; what is inside of all of them is the level's.
                 if k > 0 and before - inside > 1e-6:

@@ -21,8 +21,8 @@ _USUAL_TAU, _LEAST_TAU = 1.0, 1e-4
 _CANVAS_SKY_PX = 24
 # Nearer to the plane than this (sine of the opening) the rings are a line.
 _EDGE_ON = 2e-3
-# Samples of a turn, how often they are made four times finer, and samples inside a window that are enough.
-_COARSE, _ROUNDS, _ENOUGH = 720, 7, 120
+# Samples of a turn; samples inside a window that are enough, and pixels between them that are fine enough.
+_COARSE, _ENOUGH, _FINE_PX = 720, 120, 2.0
 _STRAIGHT_PX = 1.0
 # Pixels kept free around planets, moons and shadows.
 _BODY_PAD_PX = 5.0
@@ -168,12 +168,20 @@ class RingScene:
         )  # fmt: skip
         return np.asarray(out, np.float32)
 
+    def radius_km(self, edge: int, longitude_rad: FloatArray) -> FloatArray:
+        """(n,) radius of an edge's curve."""
+        count = self.curves.shape[1]
+        at = longitude_rad * (count / TURN)
+        low = np.floor(at).astype(np.int64)
+        share = at - low
+        curve = self.curves[edge]
+        return np.asarray(curve[low % count] * (1.0 - share) + curve[(low + 1) % count] * share)
+
     def place(self, pose: RingPose, edge: int, longitude_rad: FloatArray) -> tuple[FloatArray, BoolArray]:
         """Pixels of an edge's curve at longitudes, and which lie in front of the camera."""
-        count = self.curves.shape[1]
-        at = longitude_rad / TURN * count
-        radius = np.interp(at, np.arange(count), self.curves[edge], period=count)
-        points = np.stack([radius * np.cos(longitude_rad), radius * np.sin(longitude_rad), np.zeros(len(at))], axis=1)
+        radius = self.radius_km(edge, longitude_rad)
+        flat = np.zeros(len(radius))
+        points = np.stack([radius * np.cos(longitude_rad), radius * np.sin(longitude_rad), flat], axis=1)
         return project(self.state.camera_model, (points - pose.observer_km) @ pose.turn)
 
     def project_points(self, pose: RingPose, points_km: FloatArray) -> FloatArray:
@@ -182,8 +190,7 @@ class RingScene:
 
     def hidden(self, pose: RingPose, edge: int, longitude_rad: FloatArray) -> BoolArray:
         """Which points of an edge lie behind a body, before one or in a shadow."""
-        count = self.curves.shape[1]
-        radius = np.interp(longitude_rad / TURN * count, np.arange(count), self.curves[edge], period=count)
+        radius = self.radius_km(edge, longitude_rad)
         points = np.stack([radius * np.cos(longitude_rad), radius * np.sin(longitude_rad), 0.0 * radius], axis=1)
         covered = meets(self.forms, pose.observer_km, points - pose.observer_km)
         if self.sun.any():
@@ -343,7 +350,9 @@ def _culled(scene: RingScene, options: RingPredictionOptions) -> RingScene:
         lengths[k] = lengths.get(k, 0.0) + inside
         straight[k] = straight.get(k, True) and bow < _STRAIGHT_PX
         reason = "outside_field" if near == 0.0 else ("hidden" if hidden else "")
-        if not reason and scene.sigma_km[edge] * _px_per_km(scene) > options.max_sigma_px:
+        # Where the plane is seen foreshortened the same kilometres are fewer pixels.
+        narrow = _px_per_km(scene) * abs(float(pose.observer_km[2])) / float(np.linalg.norm(pose.observer_km))
+        if not reason and scene.sigma_km[edge] * narrow > options.max_sigma_px:
             reason = "radius_unknown"
         reasons[k] = reasons.get(k) or reason
     reasons |= dict.fromkeys(_too_near(scene, reasons, options), "merged")
@@ -434,16 +443,14 @@ def visible_longitudes(scene: RingScene, pose: RingPose, edge: int, window: Wind
     middle, half = (low + high) / 2, float(np.hypot(*(high - low))) / 2
     step = TURN / _COARSE
     longitude = step * np.arange(_COARSE)
-    for _ in range(_ROUNDS):
+    while True:
         pixels, ahead = scene.place(pose, edge, longitude)
         inside = ahead & ((pixels >= low) & (pixels <= high)).all(axis=1)
-        if inside.sum() >= _ENOUGH:
-            break
         # A stretch may pass through a corner between two samples: look at those next to the window too.
-        speed = np.hypot(*(scene.place(pose, edge, longitude + 0.5 * step)[0] - pixels).T)
-        close = ahead & ~(np.hypot(*(pixels - middle).T) > half + 2.0 * speed)
-        if not close.any():
-            return np.zeros(0)
+        speed = 2.0 * np.hypot(*(scene.place(pose, edge, longitude + 0.5 * step)[0] - pixels).T)
+        close = ahead & ~(np.hypot(*(pixels - middle).T) > half + speed)
+        if inside.sum() >= _ENOUGH or not close.any() or float(np.nanmax(speed[close])) < _FINE_PX:
+            break
         longitude = np.sort((longitude[close][:, None] + step * (np.arange(4) - 1.5) / 4.0).ravel())
         step /= 4.0
     return np.asarray(longitude[inside])

@@ -19,14 +19,15 @@ from pipeline.options import Options
 from pipeline.predict.rings import RingScene
 from pipeline.records import BoolArray, FloatArray, Image
 from pipeline.techniques.base import NavContext
-from pipeline.techniques.ring_fit import PIXEL_VARIANCE, RingFit, fit_rings
+from pipeline.techniques.ring_fit import RingFit, fit_rings
+from pipeline.techniques.ring_solve import PIXEL_VARIANCE
 
 # Side, in pixels of the coarse level, to which an image is reduced.
 _COARSE_SIDE, _COARSE_SIDE_TURNED = 256, 128
 # Light is compared after means over so many pixels of the level are taken away: what planets and skies do is wider.
 _FLATTEN = 25
 _CLIP_QUANTILE = 0.997
-_LATTICE = 30_000
+_LATTICE = 16_000
 _SCAN_PX = 12
 # Places nearer than this to the best one, in pixels across the edges, are the best one.
 _SAME_PX = 0.8
@@ -195,13 +196,16 @@ def _peaks(scene: RingScene, frame: Frame, context: NavContext, options: RingSea
         for k in order
     ]  # fmt: skip
     step = 2.0 * bound / max(count - 1, 1)
+    if not peaks:
+        return []
     for depth in (1, 2):
         if factor == 1 and not bound:
             break
         factor = max(1, factor // 2)
         fine = _flat(make_level(frame.raw, ~frame.bad, factor))
         samples = (5, 3)[depth - 1] if bound else 1
-        kept = peaks[: options.candidates // depth]
+        worth = [p for p in peaks if p.correlation >= options.rival_share * peaks[0].correlation]
+        kept = worth[: options.candidates // depth]
         peaks = [_followed(scene, fine, peak, samples, step / 2.0**depth, context) for peak in kept]
         peaks.sort(key=lambda peak: -peak.correlation)
         if not bound:

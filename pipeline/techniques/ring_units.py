@@ -116,10 +116,7 @@ def _line(
     normal = np.stack([along[:, 1], -along[:, 0]], axis=1)
     with np.errstate(invalid="ignore", divide="ignore"):
         normal /= np.hypot(*normal.T)[:, None]
-    radius = np.interp(
-        longitude / TURN * scene.curves.shape[1], np.arange(scene.curves.shape[1]), scene.curves[edge],
-        period=scene.curves.shape[1],
-    )  # fmt: skip
+    radius = scene.radius_km(edge, longitude)
     beside = _STEP * radius
     points = np.stack([np.cos(longitude), np.sin(longitude), np.zeros(len(longitude))], axis=1)
     outer = scene.project_points(pose, points * (radius + beside)[:, None])

@@ -1,0 +1,419 @@
+"""Equations of ring edges in common parameters: offset, rotation, blur, and errors of features' and edges' radii."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.geometry.rotations import plane_rotation_derivative
+from pipeline.imaging.ring_light import MOST_EDGES, assemble
+from pipeline.predict.rings import RingScene
+from pipeline.records import BoolArray, FloatArray
+from pipeline.techniques.base import NavContext
+from pipeline.techniques.lm import tukey_weight
+from pipeline.techniques.ring_units import RingUnits
+
+# A pixel integrates over its square: as much variance, in square pixels, on each axis.
+PIXEL_VARIANCE = 1.0 / 12.0
+# Prior of the blur's variance, relative to itself.
+_WIDTH_SHARE = 0.3
+# A feature is left out from so many sigmas on, if also by so many pixels, and if enough others agree.
+_OUTLIER_SIGMAS, _LEAST_OTHERS, _LEAST_TROUBLE_PX = 4.0, 2, 0.25
+# Sigma of single edges: at the start, while features are judged, and scale of its prior.
+_LOOSE_PX, _TIGHT_PX, _USUAL_EDGE_PX = 0.3, 0.02, 0.003
+# A perfect catalogue is one whose errors no pixel shows; a free radius has this share of its prior's weight.
+_PERFECT_PX, _FREE = 1e-4, 1e-12
+_TINY = 1e-12
+
+
+@dataclass(frozen=True, eq=False)
+class Layout:
+    """Order of the parameters: (dv, du[, theta], blur variance, features' radii, edges' radii).
+
+    Attributes
+    ----------
+    size
+        2 or 3.
+    used
+        (m,) features of the scene, by their index in the system.
+    column
+        (edges,) which of them each edge belongs to.
+    blur2
+        Variance of the blur, px^2.
+    km_per_px
+        At the planet's distance.
+    bounds
+        (size,) margin in pixels and largest rotation, which keep a step short where edges do not show it.
+    """
+
+    size: int
+    used: NDArray[np.int64]
+    column: NDArray[np.int64]
+    blur2: float
+    km_per_px: float
+    bounds: FloatArray
+
+    @property
+    def features(self) -> int:
+        """Number of features in use."""
+        return len(self.used)
+
+    @property
+    def count(self) -> int:
+        """Number of parameters."""
+        return self.size + 1 + self.features + len(self.column)
+
+    @property
+    def radii(self) -> slice:
+        """Where the radii are."""
+        return slice(self.size + 1, None)
+
+
+def layout_of(scene: RingScene, context: NavContext) -> Layout:
+    """Parameters of a scene.
+
+    Parameters
+    ----------
+    scene
+        Edges.
+    context
+        Bounds.
+
+    Returns
+    -------
+    Layout
+        For all rounds of a fit.
+    """
+    camera, rings = scene.state.camera_model, scene.rings
+    assert rings is not None
+    scale = camera.focal_length_mm * np.sqrt(abs(np.linalg.det(camera.k_px_per_mm)))
+    used = np.unique(scene.feature)
+    bounds = [*context.search_margin_vu, *([context.max_rotation_rad] if context.fit_camera_rotation else [])]
+    return Layout(
+        len(bounds), used, np.searchsorted(used, scene.feature).astype(np.int64), scene.sigma_px**2 + PIXEL_VARIANCE,
+        float(np.linalg.norm(rings.position_km) / scale), np.array(bounds),
+    )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class Radii:
+    """Unknown radius errors in km: of the scene's features, then of its edges alone.
+
+    An edge alone is off where its blur, or light beside it, is not what a step has; its sigma is what all edges of the
+    image show, see :func:`edge_scatter`.
+    """
+
+    values: FloatArray
+    sigma: FloatArray
+    free: BoolArray
+
+
+def first_radii(scene: RingScene, layout: Layout) -> Radii:
+    """No errors yet, catalogue's sigmas."""
+    first = np.unique(scene.feature, return_index=True)[1]
+    known = np.maximum(scene.sigma_km[first], _PERFECT_PX * layout.km_per_px)
+    sigma = np.concatenate([known, np.full(len(scene), _LOOSE_PX * layout.km_per_px)])
+    return Radii(np.zeros(len(sigma)), sigma, np.zeros(len(sigma), bool))
+
+
+@dataclass(frozen=True, eq=False)
+class Levers:
+    """How the parameters move the units' edges.
+
+    Attributes
+    ----------
+    normal, lever, scale
+        (n, 10, 2), (n, 10), (n, 10): pixels per pixel, per radian, per kilometre; zero where a unit has no such edge.
+    edges
+        (n, 2) as of the units.
+    """
+
+    normal: FloatArray
+    lever: FloatArray
+    scale: FloatArray
+    edges: NDArray[np.int64]
+
+
+def levers_of(units: RingUnits, pivot_vu: FloatArray) -> Levers:
+    """Derivatives of the units' shifts.
+
+    Parameters
+    ----------
+    units
+        Pieces of edges.
+    pivot_vu
+        (2,) centre of the rotation.
+
+    Returns
+    -------
+    Levers
+        At the units' middles.
+    """
+    arm = (units.places_vu - pivot_vu) @ plane_rotation_derivative(0.0).T
+    lever = (arm * units.normal_vu).sum(axis=2) * units.present
+    return Levers(
+        units.normal_vu * units.present[:, :, None], lever, units.px_per_km * units.present, units.edges.copy()
+    )
+
+
+def shifts_of(levers: Levers, layout: Layout, values: FloatArray) -> FloatArray:
+    """(n, 10) shifts of the units' edges by parameters, pixels."""
+    shifts = levers.normal @ values[:2]
+    if layout.size == 3:
+        shifts += levers.lever * values[2]
+    edge = np.minimum(levers.edges[:, :1] + np.arange(MOST_EDGES), len(layout.column) - 1)
+    radii = values[layout.radii]
+    return np.asarray(shifts + levers.scale * (radii[layout.column[edge]] + radii[layout.features + edge]))
+
+
+@dataclass(frozen=True, eq=False)
+class Equations:
+    """Equations of the units in their edges' shifts and the blur's variance, which comes behind the last edge.
+
+    Attributes
+    ----------
+    gram, pull
+        (n, 11, 11), (n, 11).
+    fit
+        (n, 13) chi-square, pixels, light told by the steps, contrasts.
+    freedom
+        (n,) degrees of freedom, zero where a unit tells nothing.
+    """
+
+    gram: FloatArray
+    pull: FloatArray
+    fit: FloatArray
+    freedom: FloatArray
+
+
+def calibrated(gram: FloatArray, pull: FloatArray, fit: FloatArray, steps: FloatArray) -> Equations:
+    """Equations weighted by the units' own residuals.
+
+    Contrasts that are noise make the squares of the slopes as large as their errors do; that part tells nothing.
+
+    Parameters
+    ----------
+    gram, pull, fit
+        Of :func:`pipeline.imaging.ring_light.unit_equations`.
+    steps
+        (n,) number of free contrasts.
+
+    Returns
+    -------
+    Equations
+        Of the same units.
+    """
+    freedom = np.where(fit[:, 1] > 0, fit[:, 1] - 2.0 - steps, 0.0)
+    noise = np.maximum(fit[:, 0] / np.maximum(freedom, 1.0), 1.0)
+    told = fit[:, 2] / noise
+    sure = np.clip(1.0 - 2.0 * steps / np.maximum(told, _TINY), 0.0, 1.0) / noise
+    return Equations(gram * sure[:, None, None], pull * sure[:, None], fit, np.where(sure > 0, freedom, 0.0))
+
+
+def scaled(equations: Equations, factor: float) -> Equations:
+    """The same with all variances multiplied."""
+    return replace(equations, gram=equations.gram / factor, pull=equations.pull / factor)
+
+
+def misfit(equations: Equations) -> tuple[FloatArray, FloatArray]:
+    """(n,) chi-square by which each unit's own shifts would lower its misfit, and their number."""
+    size = max(int((np.diagonal(equations.gram, axis1=1, axis2=2) > 0).sum(axis=1).max(initial=1)), 1)
+    gram, pull = equations.gram[:, :size, :size], equations.pull[:, :size]
+    diagonal = np.diagonal(gram, axis1=1, axis2=2)
+    largest = diagonal.max(axis=1, keepdims=True)
+    empty = diagonal <= 1e-9 * largest
+    ridge = np.where(empty, np.where(largest > 0, largest, 1.0), 1e-6 * diagonal)
+    own = np.linalg.solve(gram + ridge[:, :, None] * np.eye(size), pull[:, :, None])[:, :, 0]
+    rank = (~empty).sum(axis=1) * (largest[:, 0] > 0)
+    return np.maximum((own * pull).sum(axis=1), 0.0), rank.astype(float)
+
+
+def unit_weights(equations: Equations) -> FloatArray:
+    """(n,) Tukey weights by the units' misfit."""
+    chi2, rank = misfit(equations)
+    ratio = np.sqrt(chi2 / np.maximum(rank, 1.0))
+    some = rank > 0
+    if not some.any():
+        return np.ones(len(ratio))
+    # Root mean squares of a few normal variables have their median near 0.8.
+    scale = max(1.0, float(np.median(ratio[some])) / 0.8)
+    return tukey_weight(ratio, scale) * some
+
+
+@dataclass(frozen=True, eq=False)
+class System:
+    """Normal equations of all parameters without priors, about their present values."""
+
+    gram: FloatArray
+    pull: FloatArray
+    values: FloatArray
+
+
+def system_of(
+    equations: Equations, weight: FloatArray, levers: Levers, layout: Layout, values: FloatArray
+) -> System:
+    """All units together.
+
+    Parameters
+    ----------
+    equations
+        Of the units.
+    weight
+        (n,) robust weights.
+    levers, layout
+        Parameters.
+    values
+        Present ones.
+
+    Returns
+    -------
+    System
+        Symmetric.
+    """
+    gram, pull = np.zeros((layout.count, layout.count)), np.zeros(layout.count)
+    assemble(
+        equations.gram, equations.pull, weight, levers.normal, levers.lever, levers.scale, levers.edges, layout.column,
+        layout.size, layout.features, gram, pull,
+    )  # fmt: skip
+    return System((gram + gram.T) / 2, pull, values)
+
+
+def prior_of(layout: Layout, radii: Radii, hold_blur: bool) -> FloatArray:
+    """(parameters,) precision of what is known beforehand; offset and rotation have none."""
+    prior = np.zeros(layout.count)
+    prior[layout.size] = 1e12 if hold_blur else 1.0 / (_WIDTH_SHARE * layout.blur2) ** 2
+    prior[layout.radii] = np.where(radii.free, _FREE, 1.0) / radii.sigma**2
+    return prior
+
+
+def step_of(system: System, layout: Layout, radii: Radii, hold_blur: bool) -> FloatArray:
+    """(parameters,) Gauss-Newton step; not-a-number where the equations are singular."""
+    prior = prior_of(layout, radii, hold_blur)
+    pull = system.pull - prior * system.values
+    if hold_blur:
+        pull[layout.size] = 0.0
+    damping = _TINY * np.diag(system.gram)
+    damping[: layout.size] += 1.0 / layout.bounds**2
+    matrix = system.gram + np.diag(prior + damping)
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(matrix), 1e-300))
+    return np.asarray(np.linalg.solve(matrix * np.outer(scale, scale), pull * scale) * scale)
+
+
+def marginal(total: FloatArray, size: int) -> FloatArray:
+    """Information on the first parameters once the others are free."""
+    rest = total[size:, size:]
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(rest), 1e-300))
+    inverse = np.linalg.pinv(rest * np.outer(scale, scale), rcond=1e-12, hermitian=True) * np.outer(scale, scale)
+    cross = total[:size, size:]
+    result = total[:size, :size] - cross @ inverse @ cross.T
+    return np.asarray((result + result.T) / 2)
+
+
+def without_outlier(system: System, layout: Layout, radii: Radii, px_per_km: FloatArray) -> Radii:
+    """Free the radius of the feature that contradicts all others, if one does by far.
+
+    Parameters
+    ----------
+    system
+        Without priors.
+    layout, radii
+        Parameters and their priors.
+    px_per_km
+        (features + edges,) largest shift of each per kilometre, zero where it is not in the image.
+
+    Returns
+    -------
+    Radii
+        One more free at most.
+    """
+    count = layout.features
+    if count <= _LEAST_OTHERS:
+        return radii
+    tight = radii.sigma.copy()
+    seen = px_per_km[count:] > 0
+    tight[count:][seen] = _TIGHT_PX / px_per_km[count:][seen]
+    prior = prior_of(layout, replace(radii, sigma=tight), False)
+    prior[: layout.size] = 1.0 / layout.bounds**2
+    inverse = _inverse(system.gram + np.diag(prior))
+    at = layout.size + 1 + np.arange(count)
+    pull = system.pull - prior * system.values
+    pull[: layout.size] = system.pull[: layout.size]
+    value, variance = system.values[at] + (inverse @ pull)[at], inverse[at, at]
+    # A prior of precision p taken away from one unknown of variance s^2: s^2 / (1 - p s^2), and the value likewise.
+    left = np.maximum(1.0 - prior[at] * variance, 1e-9)
+    gap = value / left
+    sigma = np.sqrt(variance / left + radii.sigma[at - layout.size - 1] ** 2)
+    told = (np.diag(system.gram)[at] > 0) & ~radii.free[:count] & (left > 1e-6)
+    ratio = np.where(told, np.abs(gap) / sigma, 0.0)
+    worst = int(np.argmax(ratio))
+    others = int(told.sum()) - 1
+    off = abs(gap[worst]) * px_per_km[worst] > _LEAST_TROUBLE_PX
+    if ratio[worst] <= _OUTLIER_SIGMAS or others < _LEAST_OTHERS or not off:
+        return radii
+    free = radii.free.copy()
+    free[worst] = True
+    return replace(radii, free=free)
+
+
+def _inverse(matrix: FloatArray) -> FloatArray:
+    """Inverse of a badly scaled positive matrix."""
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(matrix), 1e-300))
+    return np.asarray(np.linalg.inv(matrix * np.outer(scale, scale)) * np.outer(scale, scale))
+
+
+def edge_scatter(system: System, layout: Layout, radii: Radii) -> Radii:
+    """Sigma of single edges: the most likely one, all other parameters being free (restricted maximum likelihood).
+
+    With the edges' own errors w of sigma s, information A and pull b on them, the likelihood is
+    ``det(I + s^2 A)^(-1/2) exp(b (A + I / s^2)^-1 b / 2)`` (Patterson and Thompson 1971, Biometrika 58, 545); a Cauchy
+    prior keeps s small where an image has too few edges to tell.
+
+    Parameters
+    ----------
+    system
+        Without priors.
+    layout, radii
+        Parameters and their priors.
+
+    Returns
+    -------
+    Radii
+        With the edges' sigma renewed.
+    """
+    first = layout.size + 1 + layout.features
+    prior = prior_of(layout, radii, False)
+    prior[: layout.size] = 1.0 / layout.bounds**2
+    # About errors of zero, not about the present ones, whose prior is left out.
+    prior[first:] = 0.0
+    own = system.values.copy()
+    own[:first] = 0.0
+    target = prior * system.values
+    target[: layout.size] = 0.0
+    pull = system.pull - target + system.gram @ own
+    gram = system.gram + np.diag(prior + _TINY * np.diag(system.gram) + 1e-300)
+    inner = _inverse(gram[:first, :first])
+    cross = gram[first:, :first]
+    block = (gram[first:, first:] - cross @ inner @ cross.T) * layout.km_per_px**2
+    told = (pull[first:] - cross @ (inner @ pull[:first])) * layout.km_per_px
+    strength, vectors = np.linalg.eigh((block + block.T) / 2)
+    strength, along = np.maximum(strength, 0.0), vectors.T @ told
+    grid = np.geomspace(1e-3, 3.0, 60)[:, None]
+    likely = (-0.5 * np.log1p(grid**2 * strength) + 0.5 * along**2 / (strength + 1.0 / grid**2)).sum(axis=1)
+    likely -= np.log1p((grid[:, 0] / _USUAL_EDGE_PX) ** 2)
+    sigma = radii.sigma.copy()
+    sigma[layout.features :] = float(grid[int(np.argmax(likely)), 0]) * layout.km_per_px
+    return replace(radii, sigma=sigma)
+
+
+def own_shifts(equations: Equations, units: RingUnits) -> tuple[FloatArray, FloatArray]:
+    """(n, 10) shifts that the units want beyond the fit, and their sigmas; not-a-number where they tell nothing."""
+    size = equations.gram.shape[1]
+    diagonal = np.diagonal(equations.gram, axis1=1, axis2=2)
+    largest = diagonal.max(axis=1, keepdims=True)
+    silent = diagonal <= 1e-6 * largest
+    ridge = np.where(silent, np.where(largest > 0, largest, 1.0), 1e-6 * diagonal)
+    inverse = np.linalg.inv(equations.gram + ridge[:, :, None] * np.eye(size))
+    shift = (inverse @ equations.pull[:, :, None])[:, :MOST_EDGES, 0]
+    sigma = np.sqrt(np.maximum(np.diagonal(inverse, axis1=1, axis2=2)[:, :MOST_EDGES], 0.0))
+    unknown = silent[:, :MOST_EDGES] | ~units.present
+    return np.where(unknown, np.nan, shift), np.where(unknown, np.nan, sigma)
