@@ -30,6 +30,8 @@ class Ball:
         Phase angle; direction of the Sun in the image, from +u toward +v.
     nearness
         Range of the scene over the ball's own: of two balls the larger is in front.
+    haze_px
+        Scale height of an atmosphere that the navigator is not told of.
     """
 
     place_vu: tuple[float, float]
@@ -37,6 +39,7 @@ class Ball:
     phase_deg: float
     sun_deg: float = 35.0
     nearness: float = 1.0
+    haze_px: float = 0.0
 
     def sun_vuz(self, rotation_rad: float = 0.0) -> FloatArray:
         """(3,) unit vector to the Sun along v, u and away from the camera."""
@@ -78,6 +81,10 @@ def light(
         sun = ball.sun_vuz(rotation_rad)
         lit = np.clip(y * sun[0] + x * sun[1] - np.sqrt(np.clip(1.0 - r2, 0.0, None)) * sun[2], 0.0, None)
         fine = np.where(r2 < 1.0, lit, fine)
+        if ball.haze_px > 0.0:
+            height_px = (np.sqrt(r2) - 1.0) * ball.radius_px
+            rim = np.clip((y * sun[0] + x * sun[1]) / np.sqrt(np.maximum(r2, 1e-9)), 0.0, None)
+            fine = np.where(r2 >= 1.0, fine + 0.6 * rim * np.exp(-height_px / ball.haze_px), fine)
     blurred = scipy.ndimage.gaussian_filter(fine, sigma_px * OVER, truncate=4.0)
     return np.asarray(blurred.reshape(rows, OVER, cols, OVER).mean(axis=(1, 3))[pad:-pad, pad:-pad])
 

@@ -58,6 +58,24 @@ def test_all_techniques_agree_on_a_disc_and_only_one_of_them_counts() -> None:
     assert {reason for _, reason in estimate.excluded} == {"dependent"}
 
 
+def test_a_haze_that_nobody_told_of_is_in_the_sigma() -> None:
+    rng = np.random.default_rng(15)
+    pulls, sigmas = [], []
+    for height_px in (1.5, 2.0, 3.0):
+        for _ in range(6):
+            planted = tuple(rng.uniform(-0.8, 0.8, 2) * MARGIN)
+            ball = Ball((80.0, 90.0), 40.0, rng.uniform(30.0, 110.0), rng.uniform(0.0, 360.0), haze_px=height_px)
+            scene = ball_scene(rng, (ball,), planted)
+            estimate = _answer(_navigate(scene))
+            sigma = np.sqrt(np.diag(estimate.covariance)[:2])
+            pulls.append((estimate.offset_vu - scene.offset_vu) / sigma)
+            sigmas.append(sigma)
+    assert float((np.abs(pulls) < 2.0).mean()) > 0.85
+    assert np.abs(pulls).max() < 4.0
+    clear = ball_scene(rng, (Ball((80.0, 90.0), 40.0, 60.0),), (3.0, 2.0))
+    assert np.diag(_answer(_navigate(clear)).covariance).max() < 0.1 * float(np.median(sigmas)) ** 2
+
+
 def test_two_bodies_one_before_the_other() -> None:
     balls = (Ball((80.0, 80.0), 34.0, 50.0), Ball((70.0, 100.0), 12.0, 50.0, nearness=2.0))
     scene = ball_scene(np.random.default_rng(13), balls, (-6.4, 8.2))

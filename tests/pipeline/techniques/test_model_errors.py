@@ -1,18 +1,22 @@
 """Errors of a rendering: correlated sums against dense covariances, and planted albedo that residuals show."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
+from pipeline.predict.bodies import BodyPredictionOptions, predict_bodies
 from pipeline.predict.body_view import BodyView, view_body
 from pipeline.records import FloatArray
 from pipeline.techniques.model_errors import (
     ModelErrorOptions,
     assumed_errors,
     correlated_sums,
+    haze_px,
     measured_errors,
 )
-from tests.scenes.body_scene import body_at, camera_of
+from tests.scenes.body_scene import body_at, body_state, camera_of
 
 CAMERA = camera_of((128, 128))
 OPTIONS = ModelErrorOptions()
@@ -40,6 +44,17 @@ def test_correlated_sums_are_those_of_a_dense_covariance(reach: float) -> None:
     scale = np.sqrt(np.outer(np.diag(dense), np.diag(dense)))[:3, :3]
     assert np.abs((mine - dense)[:3, :3] / scale).max() < 0.12
     assert mine[3, 3] == pytest.approx(dense[3, 3], rel=0.5)
+
+
+def test_a_limb_softer_than_optics_and_relief_may_have_a_haze() -> None:
+    body = body_at(CAMERA, (64.0, 64.0), 50.0, shape_sigma_km=0.0)
+    scene = predict_bodies(body_state((body,), CAMERA), 0.8, BodyPredictionOptions())
+    (view,) = scene.views
+    assert haze_px(scene, view, OPTIONS) == 0.0
+    assert haze_px(scene.with_sigma(0.95), view, OPTIONS) == 0.0
+    assert haze_px(scene.with_sigma(2.0), view, OPTIONS) == pytest.approx(np.sqrt(4.0 - 1.5 * 0.64))
+    rough = replace(view, body=replace(body, shape_sigma_km=1.5 / view.px_per_km))
+    assert haze_px(scene.with_sigma(2.0), rough, OPTIONS) == pytest.approx(np.sqrt(4.0 - 1.5 * 0.64 - 2.25))
 
 
 def test_what_is_assumed_scales_with_the_body() -> None:
