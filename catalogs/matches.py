@@ -7,6 +7,7 @@ from io import BytesIO
 import numpy as np
 import pandas as pd
 import pyarrow as pa
+from numpy.typing import NDArray
 
 from pipeline.errors import ConfigurationError
 from pipeline.geometry.wgs84 import Datum, wgs84
@@ -38,8 +39,8 @@ class MatchTable(Record):
         (n, 3, 3); None where the file has none.
     """
 
-    view_id: FloatArray
-    point_id: FloatArray
+    view_id: NDArray[np.int64]
+    point_id: NDArray[np.int64]
     pixels_vu: FloatArray
     pixel_covariance_px2: FloatArray | None
     points_km: FloatArray | None
@@ -52,7 +53,7 @@ class MatchTable(Record):
             point_covariance_km2=(n, 3, 3),
         )  # fmt: skip
 
-    def take(self, which: FloatArray) -> "MatchTable":
+    def take(self, which: NDArray[np.generic]) -> "MatchTable":
         """Rows of an index or mask."""
         return MatchTable(
             self.view_id[which], self.point_id[which], self.pixels_vu[which],
@@ -129,7 +130,7 @@ def read_matches(data: bytes, name: str) -> MatchTable:
     )  # fmt: skip
 
 
-def _integers(table: pd.DataFrame, column: str, name: str) -> FloatArray:
+def _integers(table: pd.DataFrame, column: str, name: str) -> NDArray[np.int64]:
     values = pd.to_numeric(table[column], errors="coerce")
     whole = values.notna() & (values % 1 == 0)
     if not whole.all():

@@ -3,22 +3,26 @@
 import time
 import warnings
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 
 import numpy as np
 import pyarrow as pa
+from numpy.typing import NDArray
 
 from catalogs.matches import Cameras, MatchTable
+from pipeline.camera import project
 from pipeline.errors import ConfigurationError
 from pipeline.geometry.rotations import quaternion_from_matrix
-from pipeline.pose.estimator import OpenCVGtsamPoseEstimator, PoseOptions
+from pipeline.pose.bundle import Bundle, adjust
+from pipeline.pose.estimator import OpenCVGtsamPoseEstimator, PoseOptions, place_of, vehicle_orientation
 from pipeline.pose.records import (
     CameraCalibration,
     CovarianceDegradedWarning,
     PnpFailureError,
     Pose,
     PoseEstimate,
+    PosePrior,
     SourceLabel,
     ThermalState,
 )
@@ -89,8 +93,8 @@ class PoseRow:
 class Views:
     """All views of a file, in the order of their ids."""
 
-    ids: FloatArray
-    points: FloatArray
+    ids: NDArray[np.int64]
+    points: NDArray[np.int64]
     sightings: Sightings
     given: dict[int, Pose]
     turned: bool
@@ -117,6 +121,12 @@ def _given_places(views: Views) -> Intersections:
     return Intersections(places, spread, np.zeros(count, dtype=np.int64))
 
 
+def _ranked(values: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Distinct values in order, and the rank of each."""
+    distinct, rank = np.unique(values, return_inverse=True)
+    return distinct, rank.astype(np.int64)
+
+
 def prepare(table: MatchTable, cameras: Cameras) -> Views:
     """Order views and points, and read the sense in which positions are written.
 
@@ -138,8 +148,8 @@ def prepare(table: MatchTable, cameras: Cameras) -> Views:
         If points have no places and fewer than two poses are given.
     """
     named = np.concatenate([table.view_id, np.array(list(cameras.poses), dtype=np.int64)])
-    ids, view = np.unique(named, return_inverse=True)
-    points, point = np.unique(table.point_id, return_inverse=True)
+    ids, view = _ranked(named)
+    points, point = _ranked(table.point_id)
     sightings = Sightings(view[: len(table.view_id)], point, table.pixels_vu, table.pixel_covariance_px2)
     given = {int(np.searchsorted(ids, key)): pose for key, pose in cameras.poses.items()}
     calibration = CameraCalibration.of(cameras.camera, cameras.datum)
@@ -191,6 +201,48 @@ def solve_views(views: Views, budget: Budget, every: bool) -> Iterable[PoseRow]:
             # The log has a line per throttled frame; Python's own warnings would say the first one only.
             warnings.simplefilter("ignore", CovarianceDegradedWarning)
             yield PoseRow(int(view_id), solve_view(estimator, views.calibration, matches, budget.state(started)))
+
+
+def bundle_views(views: Views, rows: list[PoseRow], sigma_km: float, sigma_rad: float) -> list[PoseRow]:
+    """All views and points adjusted together.
+
+    Parameters
+    ----------
+    views
+        With their given poses, which hold frame and scale.
+    rows
+        Views solved alone, from which the adjustment starts; failures stay failures.
+    sigma_km, sigma_rad
+        1 sigma per axis of the given poses.
+
+    Returns
+    -------
+    list of PoseRow
+        The same views with adjusted poses.
+    """
+    alone = {int(np.searchsorted(views.ids, row.view_id)): row.answer for row in rows}
+    starts = {view: answer.pose for view, answer in alone.items() if isinstance(answer, PoseEstimate)} | views.given
+    camera, sigma = views.calibration.camera, views.options.assumed_sigma_px
+    places = triangulate_views(camera, views.sightings, starts, len(views.points), sigma)
+    spread = np.diag([sigma_km**2] * 3 + [sigma_rad**2] * 3)
+    priors = {view: PosePrior(pose, spread) for view, pose in views.given.items()}
+    bundle = adjust(camera, views.sightings, starts, places, priors, sigma)
+    return [PoseRow(row.view_id, _adjusted(views, bundle, row)) for row in rows]
+
+
+def _adjusted(views: Views, bundle: Bundle, row: PoseRow) -> PoseEstimate | PnpFailureError:
+    view = int(np.searchsorted(views.ids, row.view_id))
+    if isinstance(row.answer, PnpFailureError):
+        return row.answer
+    pose = bundle.poses[view]
+    mine = (views.sightings.view == view) & np.isfinite(bundle.places_km[views.sightings.point, 0])
+    pixels, ahead = project(views.calibration.camera, pose.to_camera(bundle.places_km[views.sightings.point[mine]]))
+    rms = np.sqrt(((views.sightings.pixels_vu[mine] - pixels)[ahead] ** 2).mean(axis=0))
+    return replace(
+        row.answer, pose=pose, covariance_6x6=bundle.covariances[view], rms_px=rms, method="bundle",
+        position_wgs84=place_of(pose, views.calibration),
+        orientation_world_T_body=vehicle_orientation(pose, views.calibration),
+    )  # fmt: skip
 
 
 def compare_given(views: Views, rows: list[PoseRow]) -> FloatArray:

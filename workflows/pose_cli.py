@@ -30,6 +30,9 @@ def pose(
         Literal["auto", "marginals", "jacobian"], typer.Option(help="Graph marginals, Jacobian, or by budget.")
     ] = "auto",
     budget_s: Annotated[float | None, typer.Option(min=0.0, help="Seconds after which auto turns cheap.")] = None,
+    bundle: Annotated[bool, typer.Option("--bundle", help="Then adjust all views and points together.")] = False,
+    given_sigma_km: Annotated[float, typer.Option(min=1e-9, help="Of given positions, in the bundle.")] = 2.0,
+    given_sigma_mrad: Annotated[float, typer.Option(min=1e-9, help="Of given attitudes, in the bundle.")] = 0.5,
     verbose: Annotated[bool, typer.Option("--verbose", "-v", help="A JSON line per view.")] = False,
 ) -> None:
     """Solve views from points of known place, or of places that views with given poses make known.
@@ -38,7 +41,7 @@ def pose(
     """
     # The factor graph's library takes a while to load, which no other command should pay.
     from catalogs.matches import read_cameras, read_matches
-    from workflows.pose import Budget, CovarianceChoice, compare_given, pose_table, prepare, solve_views
+    from workflows.pose import Budget, CovarianceChoice, bundle_views, compare_given, pose_table, prepare, solve_views
 
     logging.basicConfig(level=logging.CRITICAL, format="%(message)s")
     logging.getLogger("pilotage.pose").setLevel(logging.DEBUG if verbose else logging.CRITICAL)
@@ -51,6 +54,10 @@ def pose(
             "from the camera to the body", err=True,
         )  # fmt: skip
     rows = list(solve_views(views, Budget(CovarianceChoice(covariance), budget_s), every))
+    if bundle:
+        if not views.given:
+            raise ConfigurationError(f"{cameras}: a bundle needs a given pose, which holds frame and scale")
+        rows = bundle_views(views, rows, given_sigma_km, 1e-3 * given_sigma_mrad)
     failed = [row for row in rows if isinstance(row.answer, PnpFailureError)]
     for row in failed:
         typer.echo(f"view {row.view_id}: {row.answer}", err=True)

@@ -145,7 +145,7 @@ class WgsConverter:
             root = root + step
             if (np.abs(step) <= _SETTLED * (1.0 + np.abs(root))).all():
                 break
-        return root
+        return np.asarray(root)
 
     def body_fixed(self, geodetic: FloatArray) -> FloatArray:
         """Inverse of :meth:`geodetic`.

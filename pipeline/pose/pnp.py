@@ -117,7 +117,7 @@ def starting_poses(points_km: FloatArray, xy: FloatArray, shape: SceneShape) -> 
     found, turn, shift = cv2.solvePnP((points_km - centre) / scale, xy, np.eye(3), None, flags=cv2.SOLVEPNP_SQPNP)
     if not found or not np.isfinite(shift).all():
         return []
-    matrix, _ = cv2.Rodrigues(turn)
+    matrix = np.asarray(cv2.Rodrigues(turn)[0], dtype=np.float64)
     pose = Pose(matrix, centre - scale * matrix.T @ shift[:, 0])
     return [("sqpnp", pose), ("sqpnp_mirrored", mirrored(pose, shape))]
 

@@ -126,7 +126,7 @@ class RansacFilter:
         count = 0 if index is None else len(index)
         if not found or count < min(o.min_inliers, _KERNEL_POINTS + 1) or not np.isfinite(shift).all():
             raise PnpFailureError(PnpFailure.NO_CONSENSUS, f"{count} of {len(xy)} matches agree on a pose")
-        matrix, _ = cv2.Rodrigues(turn)
+        matrix = np.asarray(cv2.Rodrigues(turn)[0], dtype=np.float64)
         inlier = np.zeros(len(xy), dtype=bool)
         inlier[np.ravel(index)] = True
         return Consensus(inlier, Pose(matrix, centre - scale * matrix.T @ shift[:, 0]))
@@ -151,7 +151,7 @@ class RansacFilter:
             (n,) True inside the gate and before the camera.
         """
         residual = plane_residuals(pose, points_km, xy)
-        ahead = np.isfinite(residual).all(axis=1)
+        ahead: BoolArray = np.asarray(np.isfinite(residual).all(axis=1))
         safe = np.where(ahead[:, None], residual, 0.0)
         squared = np.einsum("ni,nij,nj->n", safe, np.linalg.inv(covariance), safe)
         return np.asarray(ahead & (squared <= self.options.gate_sigma**2))

@@ -10,7 +10,7 @@ from enum import StrEnum
 from uuid import NAMESPACE_URL, UUID, uuid5
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from pipeline.errors import PilotageError
 from pipeline.geometry.wgs84 import Datum, Geoid
@@ -122,9 +122,9 @@ def check_covariances(name: str, values: FloatArray | None) -> None:
         raise MatchError(f"{name}: {_rows(bad)} with a sigma that is zero or negative, or not positive definite")
 
 
-def _rows(bad: NDArray[np.generic]) -> str:
+def _rows(bad: ArrayLike) -> str:
     """The first rows of a mask, in words."""
-    index = np.flatnonzero(bad)
+    index = np.flatnonzero(np.asarray(bad))
     more = f" and {len(index) - 3} more" if len(index) > 3 else ""
     return f"row {', '.join(map(str, index[:3]))}{more}"
 

@@ -44,7 +44,7 @@ class Fit(Record):
 
 
 @numba.njit(cache=True, nogil=True)
-def _cost(points: FloatArray, xy: FloatArray, white: FloatArray, c: FloatArray, p: FloatArray) -> float:
+def _cost(points, xy, white, c, p):  # type: ignore[no-untyped-def]
     total = 0.0
     for i in range(len(points)):
         x = 0.0
@@ -102,7 +102,7 @@ def _normal_equations(points, xy, white, c, p):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def _turn(r: FloatArray) -> FloatArray:
+def _turn(r):  # type: ignore[no-untyped-def]
     """Exp(-r)."""
     angle = np.sqrt(r[0] * r[0] + r[1] * r[1] + r[2] * r[2])
     s = 1.0 - angle * angle / 6.0 if angle < 1e-4 else np.sin(angle) / angle

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
 from pipeline.options import Options
@@ -105,7 +106,7 @@ class CameraTriangulation:
         if not plane.ok.all():
             raise MatchError(f"{int((~plane.ok).sum())} key points lie where the camera model has no inverse")
         turns = np.broadcast_to(camera_from_body, (len(points), 3, 3))
-        one = np.zeros(len(points), dtype=np.int64)
+        one: NDArray[np.int64] = np.zeros(len(points), dtype=np.int64)
         # Seen from the camera's position the points are where the cameras are seen from a point: r and p change places.
         lines = LinesOfSight(one, plane.xy, plane.covariance, turns, points)
         found = intersect_lines(lines, 1, self.options.method, sign=-1.0)
@@ -146,7 +147,7 @@ class LinesOfSight(Record):
         (n, 3) the known end: the camera, or the point.
     """
 
-    index: FloatArray
+    index: NDArray[np.int64]
     xy: FloatArray
     covariance: FloatArray
     camera_from_body: FloatArray
@@ -173,7 +174,7 @@ class Intersections(Record):
 
     places_km: FloatArray
     covariance_km2: FloatArray
-    refusal: FloatArray
+    refusal: NDArray[np.int64]
 
     def __post_init__(self) -> None:
         m = len(self.refusal)
@@ -185,7 +186,7 @@ class Intersections(Record):
         return np.asarray(self.refusal == 0)
 
 
-def _sums(index: FloatArray, values: FloatArray, count: int) -> FloatArray:
+def _sums(index: NDArray[np.int64], values: FloatArray, count: int) -> FloatArray:
     """Sums of (n, ...) values by index."""
     flat = values.reshape(len(values), -1)
     total = np.stack([np.bincount(index, flat[:, k], minlength=count) for k in range(flat.shape[1])], axis=1)
@@ -247,19 +248,19 @@ def intersect_lines(
     return Intersections(places, covariance, refusal)
 
 
-def _refuse(index: FloatArray, unit: FloatArray, count: int) -> FloatArray:
+def _refuse(index: NDArray[np.int64], unit: FloatArray, count: int) -> NDArray[np.int64]:
     lines = np.bincount(index, minlength=count)
     values = np.linalg.eigvalsh(_sums(index, unit.transpose(0, 2, 1) @ unit, count))
     parallel = ~(values[:, 0] > _PARALLEL * values[:, 2])
     return np.asarray(np.where(lines < 2, 1, np.where(parallel, 2, 0)))
 
 
-def _inverse(normal: FloatArray, refusal: FloatArray) -> FloatArray:
+def _inverse(normal: FloatArray, refusal: NDArray[np.int64]) -> FloatArray:
     safe = np.where((refusal > 0)[:, None, None], np.eye(3), normal)
     return np.asarray(np.linalg.inv(safe))
 
 
-def _solve(lines: LinesOfSight, rows: FloatArray, weighted: FloatArray, refusal: FloatArray) -> FloatArray:
+def _solve(lines: LinesOfSight, rows: FloatArray, weighted: FloatArray, refusal: NDArray[np.int64]) -> FloatArray:
     count = len(refusal)
     # Relative to the mean known end, so that places far from the origin lose no digits.
     number = np.maximum(np.bincount(lines.index, minlength=count), 1)[:, None]

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.pose.estimator import PoseEstimator
 from pipeline.pose.normalise import to_plane
@@ -37,8 +38,8 @@ class Sightings(Record):
         (n, 2, 2), None where nobody knows.
     """
 
-    view: FloatArray
-    point: FloatArray
+    view: NDArray[np.int64]
+    point: NDArray[np.int64]
     pixels_vu: FloatArray
     covariance_px2: FloatArray | None = None
 

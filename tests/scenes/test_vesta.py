@@ -4,7 +4,11 @@ import numpy as np
 import pytest
 
 from catalogs.matches import read_cameras, read_matches
-from pipeline.pose.records import PoseEstimate
+from pipeline.camera import project
+from pipeline.pose.bundle import adjust
+from pipeline.pose.records import Pose, PoseEstimate, PosePrior
+from pipeline.pose.views import triangulate_views
+from pipeline.records import BoolArray, FloatArray
 from tests.scenes.data import DATA, needs_data
 from workflows.pose import Budget, CovarianceChoice, Views, compare_given, prepare, solve_views
 
@@ -16,6 +20,29 @@ FOLDER = DATA / "vesta_rc3b"
 def views() -> Views:
     matches = read_matches((FOLDER / "observations.parquet").read_bytes(), "observations")
     return prepare(matches, read_cameras((FOLDER / "cameras.json").read_bytes(), "cameras"))
+
+
+def test_the_bundle_fits_no_worse_than_the_given_poses(views: Views) -> None:
+    camera, sigma = views.calibration.camera, views.options.assumed_sigma_px
+    places = triangulate_views(camera, views.sightings, views.given, len(views.points), sigma)
+    spread = np.diag([4.0] * 3 + [2.5e-7] * 3)
+    priors = {view: PosePrior(pose, spread) for view, pose in views.given.items()}
+    bundle = adjust(camera, views.sightings, views.given, places, priors, sigma)
+    before, after = (
+        _rms(views, p, x, bundle.used) for p, x in ((views.given, places.places_km), (bundle.poses, bundle.places_km))
+    )
+    assert (after <= before).all()
+    assert bundle.used.sum() > 0.99 * np.isin(views.sightings.view, list(views.given)).sum() * places.ok.mean()
+
+
+def _rms(views: Views, poses: dict[int, Pose], places_km: FloatArray, used: BoolArray) -> FloatArray:
+    """Per axis, over the sightings of a bundle."""
+    left = []
+    for view, pose in poses.items():
+        mine = (views.sightings.view == view) & used
+        pixels, _ = project(views.calibration.camera, pose.to_camera(places_km[views.sightings.point[mine]]))
+        left.append(views.sightings.pixels_vu[mine] - pixels)
+    return np.asarray(np.sqrt((np.concatenate(left) ** 2).mean(axis=0)))
 
 
 def test_given_views_solved_alone(views: Views) -> None:

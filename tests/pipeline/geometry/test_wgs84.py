@@ -17,7 +17,8 @@ def _places(seed: int, count: int = 400) -> np.ndarray:
 
 
 def test_body_fixed_agrees_with_erfa() -> None:
-    places = np.vstack([_places(0), [[90, 0, 10], [-90, 0, 10], [0, 180, 0], [0, -90, 1e3]]])
+    poles = np.array([[90.0, 0, 10], [-90, 0, 10], [0, 180, 0], [0, -90, 1e3]])
+    places = np.vstack([_places(0), poles])
     theirs = EarthLocation.from_geodetic(places[:, 1] * u.deg, places[:, 0] * u.deg, places[:, 2] * u.m)
     ours = WgsConverter().body_fixed(places)
     assert_allclose(ours, np.stack([x.to_value(u.km) for x in theirs.geocentric], axis=1), atol=1e-8)

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from pipeline.camera import project
 from pipeline.geometry.wgs84 import Datum
 from pipeline.pose.records import CameraCalibration, MatchResult, Pose
-from pipeline.records import CameraModel, FloatArray
+from pipeline.records import BoolArray, CameraModel, FloatArray
 
 CAMERAS = (
     CameraModel(
@@ -31,7 +31,7 @@ class Planted:
     matches: MatchResult
     calibration: CameraCalibration
     pose: Pose
-    good: FloatArray
+    good: BoolArray
 
 
 @dataclass(frozen=True)

@@ -187,7 +187,7 @@ def test_points_behind_the_camera_are_no_inliers() -> None:
     behind = 2 * scene.pose.position_km - m.points_km[:5]
     matches = MatchResult(
         "x", np.arange(45), np.vstack([m.pixels_vu, m.pixels_vu[:5]]), np.vstack([m.points_km, behind]),
-        np.concatenate([m.pixel_covariance_px2, m.pixel_covariance_px2[:5]]),  # type: ignore[index, list-item]
+        np.concatenate([m.pixel_covariance_px2, m.pixel_covariance_px2[:5]]),  # type: ignore[index]
     )  # fmt: skip
     estimate = OpenCVGtsamPoseEstimator().estimate(matches, scene.calibration, COOL)
     assert not estimate.inlier[40:].any()

@@ -42,11 +42,11 @@ def _set(index: tuple[int, ...], value: float) -> Callable[[np.ndarray], np.ndar
 )  # fmt: skip
 def test_each_contradiction_is_one_error(change: dict[str, np.ndarray], message: str) -> None:
     with pytest.raises(MatchError, match=message):
-        MatchResult("image", **change)
+        MatchResult("image", **change)  # type: ignore[arg-type]
 
 
 def test_good_matches_pass_and_stay_as_they_are() -> None:
-    matches = MatchResult("image", **GOOD)
+    matches = MatchResult("image", **GOOD)  # type: ignore[arg-type]
     assert len(matches) == 4
     assert not pickle.loads(pickle.dumps(matches)).points_km.flags.writeable
     assert len(MatchResult("none", np.zeros(0, int), np.zeros((0, 2)), np.zeros((0, 3)))) == 0

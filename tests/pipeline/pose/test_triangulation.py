@@ -53,7 +53,7 @@ def test_each_sigma_is_that_of_monte_carlo_and_lost_is_never_worse() -> None:
     # All trials at once: one place each, through the same function that the class calls.
     noisy = exact + rng.normal(size=(TRIALS, *exact.shape)) * 0.25
     plane = to_plane(CAMERAS[0], noisy.reshape(-1, 2), np.tile(np.eye(2) * 0.0625, (noisy[..., 0].size, 1, 1)))
-    index = np.repeat(np.arange(TRIALS), len(points))
+    index = np.repeat(np.arange(TRIALS, dtype=np.int64), len(points))
     turns = np.broadcast_to(pose.camera_from_body, (len(index), 3, 3))
     lines = LinesOfSight(index, plane.xy, plane.covariance, turns, np.tile(points, (TRIALS, 1)))
     rms = {}
@@ -85,7 +85,7 @@ def test_points_from_many_views() -> None:
     centres = np.array([[0, 0, -30.0], [8, 0, -28], [0, 9, -29], [-6, -5, -31]])
     turns = np.stack([_looking(-c) for c in centres])
     trials = 400
-    index = np.tile(np.repeat(np.arange(40), 4), trials) + np.repeat(np.arange(trials) * 40, 160)
+    index = (np.tile(np.repeat(np.arange(40), 4), trials) + np.repeat(np.arange(trials) * 40, 160)).astype(np.int64)
     view = np.tile(np.arange(4), 40 * trials)
     camera = np.einsum("nij,nj->ni", turns[view], places[index % 40] - centres[view])
     pixels, _ = project(CAMERAS[2], camera)
