@@ -124,4 +124,4 @@ def _heights(tree: RayTree, point: FloatArray, frame: FloatArray, half: int, sca
     directions = np.broadcast_to(-frame[2], (steps.size**2, 3))
     down, _ = cast(tree, plane.reshape(-1, 3), directions)
     heights = (reach - np.where(down <= 2.0 * reach, down, np.nan)) / scale_km
-    return heights.reshape(steps.size, steps.size)
+    return np.asarray(heights.reshape(steps.size, steps.size))

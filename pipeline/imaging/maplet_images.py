@@ -23,7 +23,7 @@ _FIXED_BETA = 0.65
 _MINNAERT_K = 0.7
 # Samples along a side of a cell that covers several pixels, at most.
 _MOST_SAMPLES = 6
-# Cells toward the Sun that must be dark for a lit cell to be the end of a shadow; widening on both sides of what it cuts.
+# Cells toward the Sun that must be dark behind the end of a shadow; widening on both sides of what is cut there.
 _SHADOW_RUN = 3
 _SHADOW_WIDENING = 2
 

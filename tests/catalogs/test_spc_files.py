@@ -58,7 +58,7 @@ def test_bytes_stand_where_the_format_says() -> None:
     assert np.frombuffer(data[6:10], ">f4")[0] == np.float32(1e-5)
     assert int.from_bytes(data[10:12], "little") == 49
     assert data[12:15] == bytes([100, 200, 124])
-    assert np.frombuffer(data[51:63], ">f4").tolist() == np.float32(REAL_AXES[2]).tolist()
+    assert np.frombuffer(data[51:63], ">f4").tolist() == np.array(REAL_AXES[2], np.float32).tolist()
     cell = 72 + 3 * (99 * 10 + 4)
     assert int.from_bytes(data[cell : cell + 2], "big", signed=True) == real_map().steps[10, 4]
     assert data[cell + 2] == real_map().albedo_steps[10, 4]

@@ -60,7 +60,7 @@ def test_eq_3_58_is_pearsons_over_the_common_cells_of_every_shift() -> None:
             both = me[k, m]
             expected = np.corrcoef(p[i[both], j[both]], e[k[both], m[both]])[0, 1]
             assert surface[a, b] == pytest.approx(expected, abs=1e-9)
-    assert np.unravel_index(np.nanargmax(surface), surface.shape) == (8, 3)
+    assert int(np.nanargmax(surface)) == 8 * 11 + 3
 
 
 def test_eq_3_58_the_sign_of_a_shift() -> None:

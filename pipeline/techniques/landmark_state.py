@@ -1,0 +1,234 @@
+"""Position and attitude of a camera from landmarks: weighted Gauss-Newton with an a-priori state (seed 001 section 2).
+
+The state is the camera's body-fixed position and a small rotation with ``T' = Exp(-dtheta) T``, T turning body-fixed
+into camera axes. Results are reported in the project's order (x, y, z, rx, ry, rz), all body-fixed:
+``dp = p_est - p_true`` and ``body_from_camera_true = Exp(r) body_from_camera_est``.
+"""
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from pydantic import Field
+from scipy.special import chdtri
+
+from pipeline.camera import project, project_jacobian
+from pipeline.geometry.maplet import MapletView
+from pipeline.geometry.rotations import rotation_about
+from pipeline.options import Options
+from pipeline.records import BoolArray, FloatArray, Record
+
+_STEPS = 25
+# Rounds in which outliers are only weighted down, before any is rejected.
+_SOFT_ROUNDS = 4
+_HUBER_SIGMAS = 1.5
+# An update shorter than this share of its own sigma changes nothing.
+_SETTLED_SIGMAS = 1e-4
+# A scaled eigenvalue below this says that the landmarks alone do not see a direction.
+_BLIND = 1e-9
+
+
+class LandmarkStateOptions(Options):
+    """Weighting and outliers."""
+
+    landmark_errors: Literal["solve", "consider"] = Field(
+        "solve", description="landmarks are estimated along, or their errors only inflate the covariance"
+    )
+    outlier_chance: float = Field(1e-3, gt=0, lt=0.5, description="chance by which a good landmark is rejected")
+    least_landmarks: int = Field(4, ge=1, description="landmarks that must remain")
+
+
+@dataclass(frozen=True, eq=False)
+class LandmarkState(Record):
+    """Updated state.
+
+    Attributes
+    ----------
+    view
+        Camera at its new place.
+    covariance
+        (6, 6), km and rad, order (x, y, z, rx, ry, rz), body-fixed.
+    residual_vu
+        (n, 2) observed minus predicted at the new state.
+    used
+        (n,) landmarks that took part.
+    observable
+        Directions of the state, of six, that the landmarks see without the a-priori state.
+    steps
+        Gauss-Newton steps.
+    converged
+        The last step was as short as asked for.
+    """
+
+    view: MapletView
+    covariance: FloatArray
+    residual_vu: FloatArray
+    used: BoolArray
+    observable: int
+    steps: int
+    converged: bool
+
+    def __post_init__(self) -> None:
+        n = len(self.used)
+        self._freeze(covariance=(6, 6), residual_vu=(n, 2), used=(n,))
+
+
+def state_partials(view: MapletView, landmarks_km: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Partials of the measurement (eq. 2.20-2.32 as corrected).
+
+    Parameters
+    ----------
+    view
+        Camera and body.
+    landmarks_km
+        (n, 3) body-fixed.
+
+    Returns
+    -------
+    tuple
+        (n, 2, 6) d(v, u)/d(position, dtheta), per km and rad; (n, 2, 3) d(v, u)/d(landmark), per km. With
+        a = T (x - t): da/dt = -T, da/dtheta = [a x], da/dx = T.
+    """
+    turn = view.camera_from_body
+    seen = (landmarks_km - view.position_km) @ turn.T
+    pixels = project_jacobian(view.camera, seen)
+    by_place = pixels @ turn
+    zero = np.zeros(len(seen))
+    x, y, z = seen.T
+    cross = np.stack(
+        [np.stack([zero, -z, y], axis=1), np.stack([z, zero, -x], axis=1), np.stack([-y, x, zero], axis=1)], axis=1
+    )
+    return np.concatenate([-by_place, pixels @ cross], axis=2), by_place
+
+
+def turned(camera_from_body: FloatArray, dtheta: FloatArray) -> FloatArray:
+    """Attitude after an update: ``Exp(-dtheta) T``, exact and not to first order.
+
+    Parameters
+    ----------
+    camera_from_body
+        (3, 3).
+    dtheta
+        (3,) rad, camera axes.
+
+    Returns
+    -------
+    numpy.ndarray
+        (3, 3) rotation.
+    """
+    angle = float(np.linalg.norm(dtheta))
+    if angle == 0.0:
+        return camera_from_body
+    return np.asarray(rotation_about(-dtheta / angle, angle) @ camera_from_body)
+
+
+def _angle_between(before: FloatArray, after: FloatArray) -> FloatArray:
+    """The dtheta of :func:`turned` that leads from one attitude to a near one."""
+    change = before @ after.T
+    vector = 0.5 * np.array([change[2, 1] - change[1, 2], change[0, 2] - change[2, 0], change[1, 0] - change[0, 1]])
+    sine = float(np.linalg.norm(vector))
+    cosine = (float(np.trace(change)) - 1.0) / 2.0
+    return vector * (np.arctan2(sine, cosine) / sine if sine > 0 else 1.0)
+
+
+def update_state(
+    view: MapletView, matches: tuple[FloatArray, FloatArray, FloatArray, FloatArray], prior_covariance: FloatArray,
+    options: LandmarkStateOptions,
+) -> LandmarkState | str:  # fmt: skip
+    """Camera's position and attitude from observed landmarks.
+
+    Parameters
+    ----------
+    view
+        A-priori geometry.
+    matches
+        (n, 3) landmarks, body-fixed km; (n, 3, 3) their covariances; (n, 2) observed pixels; (n, 2, 2) their
+        covariances.
+    prior_covariance
+        (6, 6) of the a-priori state, km and rad, order (x, y, z, rx, ry, rz), body-fixed; infinite on the diagonal of
+        what is not known.
+    options
+        Weighting and outliers.
+
+    Returns
+    -------
+    LandmarkState or str
+        Updated state, or why there is none.
+    """
+    place, place_covariance, observed, covariance = matches
+    n = len(place)
+    if n < options.least_landmarks:
+        return f"{n} landmarks"
+    prior = _prior_information(prior_covariance, view.camera_from_body)
+    weight, used = np.ones(n), np.ones(n, bool)
+    limit = float(chdtri(2, options.outlier_chance))
+    now, settled, step = view, False, 0
+    normal, middle = prior, np.zeros((6, 6))
+    for step in range(1, _STEPS + 1):
+        if not (project(view.camera, (place - now.position_km) @ now.camera_from_body.T)[1]).all():
+            return "a landmark came to lie behind the camera"
+        partials, by_place = state_partials(now, place)
+        residual = observed - now.pixels(place)[0]
+        from_place = by_place @ place_covariance @ by_place.transpose(0, 2, 1)
+        total = covariance + from_place
+        chosen = np.linalg.inv(total if options.landmark_errors == "solve" else covariance)
+        weights = chosen * (weight * used)[:, None, None]
+        normal = np.einsum("nia,nij,njb->ab", partials, weights, partials) + prior
+        behind = np.concatenate(
+            [view.position_km - now.position_km, -_angle_between(view.camera_from_body, now.camera_from_body)]
+        )
+        update = np.linalg.pinv(normal, hermitian=True) @ (
+            np.einsum("nia,nij,nj->a", partials, weights, residual) + prior @ behind
+        )
+        middle = np.einsum("nia,nij,njk,nkl,nlb->ab", partials, weights, from_place, weights, partials)
+        now = replace(
+            now, position_km=now.position_km + update[:3], camera_from_body=turned(now.camera_from_body, update[3:])
+        )
+        distance2 = np.einsum("ni,nij,nj->n", residual, np.linalg.inv(total), residual)
+        soft = step <= _SOFT_ROUNDS
+        weight = np.minimum(1.0, _HUBER_SIGMAS / np.sqrt(np.maximum(distance2, 1e-12))) if soft else np.ones(n)
+        settled = float(update @ normal @ update) < _SETTLED_SIGMAS**2
+        if not soft and settled:
+            keep = distance2 <= limit
+            if np.array_equal(keep, used):
+                break
+            used = keep
+            if used.sum() < options.least_landmarks:
+                return f"{int(used.sum())} of {n} landmarks agree"
+    return _state(now, (place, observed), (partials, weights, normal, middle), used, (step, settled), options)
+
+
+def _prior_information(covariance: FloatArray, camera_from_body: FloatArray) -> FloatArray:
+    """Information of the a-priori state in (position, dtheta); zero for what is not known.
+
+    ``r = T' dtheta`` (T' = body from camera), so that dtheta = T r.
+    """
+    known = np.isfinite(np.diag(covariance))
+    information = np.zeros((6, 6))
+    information[np.ix_(known, known)] = np.linalg.inv(covariance[np.ix_(known, known)])
+    turn = _into_body(camera_from_body)
+    return np.asarray(turn.T @ information @ turn)
+
+
+def _into_body(camera_from_body: FloatArray) -> FloatArray:
+    turn = np.eye(6)
+    turn[3:, 3:] = camera_from_body.T
+    return turn
+
+
+def _state(
+    now: MapletView, matches: tuple[FloatArray, FloatArray], sums: tuple[FloatArray, ...], used: BoolArray,
+    ended: tuple[int, bool], options: LandmarkStateOptions,
+) -> LandmarkState:  # fmt: skip
+    place, observed = matches
+    partials, weights, normal, middle = sums
+    covariance = np.linalg.pinv(normal, hermitian=True)
+    if options.landmark_errors == "consider":
+        covariance = covariance + covariance @ middle @ covariance
+    alone = np.einsum("nia,nij,njb->ab", partials, weights, partials)
+    scale = np.sqrt(np.maximum(np.diag(alone), 1e-300))
+    seen = int((np.linalg.eigvalsh(alone / np.outer(scale, scale)) > _BLIND).sum())
+    turn = _into_body(now.camera_from_body)
+    return LandmarkState(
+        now, turn @ covariance @ turn.T, observed - now.pixels(place)[0], used, seen, ended[0], ended[1]
+    )

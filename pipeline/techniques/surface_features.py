@@ -1,0 +1,246 @@
+"""SurfaceFeatureNav: maplets predicted, aligned together, found one by one, and fitted as one pointing."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+from scipy.stats import binom
+
+from pipeline.camera import project, project_jacobian
+from pipeline.frame import Frame
+from pipeline.geometry.maplet import Maplet, MapletIndex, MapletView
+from pipeline.geometry.pointing import corrected_attitude, move_pivot
+from pipeline.geometry.rays import RayTree
+from pipeline.imaging.maplet_images import MapletImageOptions
+from pipeline.predict.maplet_removal import RemovalOptions, removal_reason
+from pipeline.predict.maplets import CullingOptions, MapletReason, Visibility, cull, maplet_jacobian, view_of
+from pipeline.records import Body, BoolArray, FloatArray, Image, State
+from pipeline.status import StatusReason
+from pipeline.techniques.base import NavContext, TechniqueFailure, TechniqueOptions, TechniqueResult, edge_flags
+from pipeline.techniques.landmark_table import LandmarkTable
+from pipeline.techniques.maplet_alignment import Alignment, align, light_of
+from pipeline.techniques.maplet_correlation import REACH, CorrelationOptions, LandmarkMatch, PeakStatus, locate
+from pipeline.techniques.star_fit import StarFit, StarFitOptions, fit_stars
+
+NAME = "SurfaceFeatureNav"
+# The alignment may be off by half a reduced pixel and a pixel for relief and twist; searches use four of five bins.
+_ALIGNMENT_PX = 1.0
+_USABLE_BINS = REACH - 1
+# Radius within which a landmark counts as where the others say, for the chance that mere luck put it there.
+_AGREEMENT_PX = 1.5
+
+
+class SurfaceFeatureOptions(TechniqueOptions):
+    """Options of the whole technique."""
+
+    culling: CullingOptions = CullingOptions()
+    images: MapletImageOptions = MapletImageOptions()
+    removal: RemovalOptions = RemovalOptions()
+    correlation: CorrelationOptions = CorrelationOptions()
+    fit: StarFitOptions = StarFitOptions()
+    most_landmarks: int = Field(120, ge=4, le=5000, description="maplets looked for in one picture, at most")
+    least_landmarks: int = Field(4, ge=1, description="landmarks that must agree")
+    rounds: int = Field(2, ge=1, le=5, description="times that all landmarks are looked for, geometry renewed between")
+    removed_by_hand: tuple[str, ...] = Field((), description="landmarks never used (seed 001 section 3.4)")
+
+
+@dataclass(frozen=True)
+class MapletSource:
+    """Maplets of one body.
+
+    Attributes
+    ----------
+    body
+        Its name, as in the State.
+    index
+        All maplets but their height fields.
+    load
+        Gives one maplet by its row.
+    surface
+        The body's surface and its largest diameter in km; None where no shape is known.
+    """
+
+    body: str
+    index: MapletIndex
+    load: Callable[[int], Maplet]
+    surface: tuple[RayTree, float] | None
+
+
+@dataclass(frozen=True, eq=False)
+class _Search:
+    """What stays the same from round to round."""
+
+    maplets: list[Maplet]
+    index: MapletIndex
+    rows: NDArray[np.int64]
+    picture: tuple[Image, BoolArray]
+    options: SurfaceFeatureOptions
+
+
+def surface_feature_nav(
+    body: Body, source: MapletSource, frame: Frame, state: State, options: SurfaceFeatureOptions
+) -> tuple[TechniqueResult | TechniqueFailure, LandmarkTable | None]:
+    """Find a body's landmarks in a picture.
+
+    Parameters
+    ----------
+    body
+        As the State places it.
+    source
+        Its maplets.
+    frame
+        Image.
+    state
+        Geometry.
+    options
+        Of every stage.
+
+    Returns
+    -------
+    tuple
+        Answer about the centroid of the landmarks; one row per landmark looked for, None where none can be seen.
+    """
+    context, view = NavContext.of(state), view_of(state, body)
+    seen = cull(view, source.index, source.surface, options.culling)
+    rows = _chosen(seen, options.most_landmarks)
+    if not len(rows):
+        return TechniqueFailure(NAME, StatusReason.NO_FEATURES_PREDICTED, f"{body.name}: {_tally(seen)}"), None
+    search = _Search([source.load(int(row)) for row in rows], source.index, rows, (frame.raw, ~frame.bad), options)
+    cells = light_of(view, search.maplets, options.images)
+    alignment = align(cells, search.picture, context.search_margin_vu, context.max_rotation_rad)
+    if alignment is None:
+        return TechniqueFailure(NAME, StatusReason.NO_FEATURES_DETECTED, f"{body.name}: no light varies"), None
+    offset, _ = move_pivot(
+        alignment.offset_vu, alignment.rotation_rad, alignment.pivot_vu, context.camera_model.centre_vu
+    )
+    return _rounds(search, view, body, context, (offset, alignment))
+
+
+def _chosen(seen: Visibility, most: int) -> NDArray[np.int64]:
+    """Rows looked for: those whose cells come nearest to a pixel first, spread evenly where there are too many."""
+    rows = seen.used
+    octave = np.rint(np.abs(np.log2(seen.ratio[rows]))).astype(int)
+    # Multiples of the golden ratio visit any row of maplets evenly.
+    spread = np.arange(len(rows)) * 0.6180339887498949 % 1.0
+    return np.sort(rows[np.lexsort((spread, octave))[:most]])
+
+
+def _tally(seen: Visibility) -> str:
+    counts = np.bincount(seen.reason, minlength=len(MapletReason))
+    return ", ".join(f"{count} {MapletReason(k).name.lower()}" for k, count in enumerate(counts) if count)
+
+
+def _rounds(
+    search: _Search, view: MapletView, body: Body, context: NavContext, start: tuple[FloatArray, Alignment]
+) -> tuple[TechniqueResult | TechniqueFailure, LandmarkTable]:
+    options, camera = search.options, context.camera_model
+    offset, alignment = start
+    attitude = corrected_attitude(camera, view.camera_from_body, offset, alignment.rotation_rad)
+    uncertainty = alignment.factor / 2.0 + _ALIGNMENT_PX
+    table: LandmarkTable | None = None
+    fit: StarFit | None = None
+    for _ in range(options.rounds):
+        table = _looked_for(search, view, replace(view, camera_from_body=attitude), uncertainty)
+        found = np.flatnonzero(table.found)
+        if len(found) < max(options.least_landmarks, 1):
+            detail = f"{body.name}: {len(found)} of {len(table)} landmarks found"
+            return TechniqueFailure(NAME, StatusReason.NO_FEATURES_DETECTED, detail), table
+        fit = _fit(table, found, view, body, context, options)
+        used = np.zeros(len(table), bool)
+        used[found[fit.inlier]] = True
+        table = replace(table, used=used)
+        attitude = corrected_attitude(camera, view.camera_from_body, fit.centre_offset_vu, fit.rotation_rad)
+        uncertainty = 0.0
+    assert table is not None
+    assert fit is not None
+    return _answer(fit, table, alignment, body, context, options), table
+
+
+def _looked_for(search: _Search, before: MapletView, view: MapletView, uncertainty_px: float) -> LandmarkTable:
+    """Look for every landmark under a view; rows carry the prediction under the a-priori one."""
+    index, rows = search.index, search.rows
+    jacobians = maplet_jacobian(view, index, rows)
+    predicted, now = before.pixels(index.landmark_km[rows])[0], view.pixels(index.landmark_km[rows])[0]
+    observed, covariance = np.full((len(rows), 2), np.nan), np.full((len(rows), 2, 2), np.nan)
+    correlation, size = np.full(len(rows), np.nan), np.zeros(len(rows), np.int64)
+    status = []
+    ratio = 1.0 / np.sqrt(np.abs(np.linalg.det(jacobians)))
+    for k, maplet in enumerate(search.maplets):
+        match, reason = _match(search, view, maplet, jacobians[k], float(ratio[k]), uncertainty_px)
+        status.append(reason)
+        correlation[k], size[k] = match.correlation, match.bin
+        if reason == PeakStatus.FOUND.value:
+            observed[k], covariance[k] = now[k] + match.offset_vu, match.covariance_px2
+    normal = index.maplet_from_body[rows, 2]
+    sight = before.position_km - index.landmark_km[rows]
+    emission = (normal * sight).sum(axis=1) / np.linalg.norm(sight, axis=1)
+    return LandmarkTable(
+        index.name[rows], index.landmark_km[rows], index.covariance_km2[rows], predicted, observed, covariance,
+        correlation, size, _degrees(normal @ view.sun), _degrees(emission), ratio, np.zeros(len(rows), bool),
+        np.array(status),
+    )  # fmt: skip
+
+
+def _degrees(cosine: FloatArray) -> FloatArray:
+    return np.asarray(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
+
+
+def _match(
+    search: _Search, view: MapletView, maplet: Maplet, jacobian: FloatArray, ratio: float, uncertainty_px: float
+) -> tuple[LandmarkMatch, str]:
+    options = search.options
+    size = max(1, int(np.ceil(uncertainty_px * ratio / _USABLE_BINS)))
+    correlation = options.correlation.model_copy(update={"bin_start": size})
+    match = locate(view, maplet, search.picture, jacobian, np.zeros(2), (options.images, correlation))
+    reason = removal_reason(match.images, ratio, maplet.name, options.removed_by_hand, options.removal)
+    return match, match.status.value if reason is MapletReason.USED else reason.name.lower()
+
+
+def _fit(
+    table: LandmarkTable, found: NDArray[np.int64], view: MapletView, body: Body, context: NavContext,
+    options: SurfaceFeatureOptions,
+) -> StarFit:  # fmt: skip
+    """Pointing that carries the landmarks' directions onto their observed pixels."""
+    sight = table.landmark_km[found] - view.position_km
+    direction = sight @ body.body_from_j2000
+    direction /= np.linalg.norm(direction, axis=1)[:, None]
+    camera_points = sight @ view.camera_from_body.T
+    places = project_jacobian(context.camera_model, camera_points) @ view.camera_from_body
+    from_places = places @ table.landmark_covariance_km2[found] @ places.transpose(0, 2, 1)
+    predicted = project(context.camera_model, camera_points)[0]
+    return fit_stars(
+        context, direction, predicted, table.observed_vu[found], table.covariance_px2[found] + from_places, options.fit
+    )
+
+
+def _answer(
+    fit: StarFit, table: LandmarkTable, alignment: Alignment, body: Body, context: NavContext,
+    options: SurfaceFeatureOptions,
+) -> TechniqueResult | TechniqueFailure:  # fmt: skip
+    agreeing = int((np.abs(fit.residual_vu[fit.inlier]).max(axis=1) < _AGREEMENT_PX).sum())
+    if agreeing < options.least_landmarks:
+        detail = f"{body.name}: {agreeing} of {len(table)} landmarks agree"
+        return TechniqueFailure(NAME, StatusReason.NO_MATCH, detail)
+    at_edge, at_edge_rotation = edge_flags(fit.centre_offset_vu, fit.rotation_rad, context, options)
+    return TechniqueResult(
+        technique=NAME, offset_vu=fit.offset_vu, rotation_rad=fit.rotation_rad, information=fit.information,
+        pivot_vu=fit.pivot_vu, confidence=_confidence(agreeing, table, context), measurements=agreeing,
+        at_edge=at_edge, at_edge_rotation=at_edge_rotation, error_sources=(f"shape of {body.name}",),
+        diagnostics={
+            "landmarks_used": int(fit.inlier.sum()), "landmarks_looked_for": len(table),
+            "extra_sigma_px": fit.extra_sigma_px, "alignment_correlation": alignment.correlation,
+        },
+    )  # fmt: skip
+
+
+def _confidence(agreeing: int, table: LandmarkTable, context: NavContext) -> float:
+    """One minus the expected number of wrong offsets within the margin on which as many would agree by luck.
+
+    A landmark that is not there peaks anywhere in its window of 11 x 11 cells.
+    """
+    window_px2 = ((2 * REACH + 1) / np.median(table.ratio)) ** 2
+    chance = min(1.0, np.pi * _AGREEMENT_PX**2 / window_px2)
+    offsets = float(np.prod(2.0 * np.array(context.search_margin_vu) / _AGREEMENT_PX))
+    return float(1.0 - min(1.0, offsets * binom.sf(agreeing - 1, len(table), min(chance, 0.5))))
