@@ -188,26 +188,28 @@ def _texture(d, region, low, high, longitude):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True)
-def ring_light(d, radius, longitude, width, mu, mu0, lit):  # type: ignore[no-untyped-def]
-    """Light of a stretch of radii under the whole Sun, that of rings without texture, and the share let through."""
+def ring_light(d, radius, longitude, width, mu, mu0, lit, behind):  # type: ignore[no-untyped-def]
+    """Light of a stretch of radii under the whole Sun, and the share of what lies behind that they let through.
+
+    The share is worked out only if something lies behind.
+    """
     low, high = radius - 0.5 * width, radius + 0.5 * width
     count = d.edges.shape[1]
-    light, plain, through = 0.0, 0.0, 0.0
+    light, through = 0.0, 0.0
     k, start = first_edge(d, longitude, low), low
     while True:
         stop = high if k == count else min(edge_at(d, longitude, k), high)
         share = (stop - start) / width
         if share > 0.0 and d.tau[k] > 0.0:
             tau = d.tau[k]
-            plain += share * scattered(tau, d.scatter[k], mu, mu0, lit)
             depth, shade = _texture(d, k, start, stop, longitude)
             light += share * shade * scattered(tau * depth, d.scatter[k], mu, mu0, lit)
-            through += share * np.exp(-tau * depth / mu)
+            through += share * np.exp(-tau * depth / mu) if behind else 0.0
         else:
             through += share
         start = stop
         if k == count or stop >= high:
-            return light, plain, through
+            return light, through
         k += 1
 
 
@@ -232,5 +234,5 @@ def sun_through_rings(d, x, y, z, spread):  # type: ignore[no-untyped-def]
     a, b = a + way * d.sun[0], b + way * d.sun[1]
     mu0 = abs(d.sun[2])
     spread += 2.0 * way * d.sun_radius
-    _, _, through = ring_light(d, np.sqrt(a * a + b * b), turned_longitude(a, b), spread, mu0, mu0, True)
+    _, through = ring_light(d, np.sqrt(a * a + b * b), turned_longitude(a, b), spread, mu0, mu0, True, True)
     return through

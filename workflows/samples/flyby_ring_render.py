@@ -36,13 +36,13 @@ SMALL_PX = 30.0
 
 
 class Cells(NamedTuple):
-    """Light (2, 2, rows, columns) of the cells of a bordered canvas: all of it, and without texture and relief.
+    """Light (2, 2, rows, columns) of the cells of a bordered canvas: all of it, and of smooth grey bodies alone.
 
     rings (rows, columns) is the light of the rings alone, by pixels.
     """
 
-    rough: FloatArray
-    plain: FloatArray
+    total: FloatArray
+    bodies: FloatArray
     rings: FloatArray
 
 
@@ -99,6 +99,15 @@ def bodies_near(s, v, u, x, y, z, near):  # type: ignore[no-untyped-def]
     return met, limb
 
 
+@numba.njit(cache=True, inline="always")
+def _in_reach(centre_vu, reach_px, v, u):  # type: ignore[no-untyped-def]
+    """Whether any body's light can fall on a pixel; handing all of the bodies to a function costs more than this."""
+    for k in range(len(reach_px)):
+        if (v - centre_vu[k, 0]) ** 2 + (u - centre_vu[k, 1]) ** 2 <= reach_px[k] ** 2:
+            return True
+    return False
+
+
 @numba.njit(cache=True)
 def radius_grid(d, across):  # type: ignore[no-untyped-def]
     """Radius (rows, columns) at which each of some directions (x/z, y/z) meets the ring plane, -1 where it does not."""
@@ -123,9 +132,9 @@ def radius_slopes(radii, i, j):  # type: ignore[no-untyped-def]
     return 0.5 * (down - up), 0.5 * (right - left), bend
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, inline="always")
 def _sample(d, x, y, width, reached, body):  # type: ignore[no-untyped-def]
-    """Light of one line of sight, without texture, and of the rings alone; body is what it meets behind the rings."""
+    """Light of one line of sight, of its smooth body alone, and of the rings alone; body is what it meets."""
     distance, rough, smooth = body
     if not reached:
         return rough, smooth, 0.0
@@ -133,12 +142,13 @@ def _sample(d, x, y, width, reached, body):  # type: ignore[no-untyped-def]
     if way <= 0.0 or 0.0 < distance < way:
         return rough, smooth, 0.0
     mu0, lit = abs(d.sun[2]), d.sun[2] * d.eye[2] > 0.0
-    light, plain, through = ring_light(d, np.sqrt(a * a + b * b), turned_longitude(a, b), width, mu, mu0, lit)
+    radius, longitude, behind = np.sqrt(a * a + b * b), turned_longitude(a, b), distance > 0.0
+    light, through = ring_light(d, radius, longitude, width, mu, mu0, lit, behind)
     sun = lit_share(d, a, b, width)
-    return sun * light + through * rough, sun * plain + through * smooth, sun * light
+    return sun * light + through * rough, through * smooth, sun * light
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, inline="always")
 def _is_even(d, here, radius, reach):  # type: ignore[no-untyped-def]
     """Whether neither an edge nor the shadow's rim comes nearer to a pixel than a stretch of radii."""
     _, a, b, _ = in_plane(d, here[0], here[1], 1.0)
@@ -162,7 +172,9 @@ def gather_cells(s, d, planet, across, radii, cells):  # type: ignore[no-untyped
     for row in range(cells.rings.shape[0]):
         for column in range(cells.rings.shape[1]):
             here, radius = across[row + 1, column + 1], radii[row + 1, column + 1]
-            met, limb = bodies_near(s, row - BORDER_PX, column - BORDER_PX, here[0], here[1], 1.0, near)
+            met, limb = False, False
+            if _in_reach(s.centre_vu, s.reach_px, row - BORDER_PX, column - BORDER_PX):
+                met, limb = bodies_near(s, row - BORDER_PX, column - BORDER_PX, here[0], here[1], 1.0, near)
             slope_v, slope_u, bend = radius_slopes(radii, row + 1, column + 1)
             slope = max(np.sqrt(slope_v * slope_v + slope_u * slope_u), 1e-9)
             reach = slope + 0.5 * bend
@@ -186,14 +198,14 @@ def gather_cells(s, d, planet, across, radii, cells):  # type: ignore[no-untyped
                     y = here[1] + pv * down[1] + pu * right[1]
                     if limb:
                         body = body_at(s, d, near, planet, x, y, 1.0, slope)
-                    light, plain, own = _sample(d, x, y, slope / n, reached, body)
+                    light, smooth, own = _sample(d, x, y, slope / n, reached, body)
                     cells.rings[row, column] += own / (n * n)
                     if n == 1:
-                        cells.rough[:, :, row, column] = light
-                        cells.plain[:, :, row, column] = plain
+                        cells.total[:, :, row, column] = light
+                        cells.bodies[:, :, row, column] = smooth
                     else:
-                        cells.rough[2 * i // n, 2 * j // n, row, column] += 4.0 / (n * n) * light
-                        cells.plain[2 * i // n, 2 * j // n, row, column] += 4.0 / (n * n) * plain
+                        cells.total[2 * i // n, 2 * j // n, row, column] += 4.0 / (n * n) * light
+                        cells.bodies[2 * i // n, 2 * j // n, row, column] += 4.0 / (n * n) * smooth
 
 
 @numba.njit(cache=True)
@@ -228,7 +240,7 @@ def _spread_along_v(halves, kernel):  # type: ignore[no-untyped-def]
 
 
 def gather_ring_light(camera: SampleCamera, wings: tuple[float, float], spheres: Spheres, disc: RingDisc) -> Light:
-    """Return the light that a camera gathers from rings and bodies; its target is the rings.
+    """Return the light that a camera gathers from rings and bodies; its target is the rings, its shifts the bodies'.
 
     Parameters
     ----------
@@ -244,10 +256,11 @@ def gather_ring_light(camera: SampleCamera, wings: tuple[float, float], spheres:
     across = directions(camera)
     gather_cells(spheres, disc, spheres.target, across, radius_grid(disc, across), cells)
     share, slope = cell_kernels(camera.psf_sigma_px)
-    total = _spread_along_v(_spread_along_u(cells.rough, share), share)
-    plain_u = _spread_along_u(cells.plain, share)
-    shift_v = _spread_along_v(plain_u, slope)
-    shift_u = _spread_along_v(_spread_along_u(cells.plain, slope), share)
+    total = _spread_along_v(_spread_along_u(cells.total, share), share)
+    shift_v, shift_u = np.zeros_like(total), np.zeros_like(total)
+    if cells.bodies.any():
+        shift_v = _spread_along_v(_spread_along_u(cells.bodies, share), slope)
+        shift_u = _spread_along_v(_spread_along_u(cells.bodies, slope), share)
     frame = tuple(slice(BORDER_PX, BORDER_PX + size) for size in camera.shape_vu)
     core = 1.0 - wings[0]
     return Light(

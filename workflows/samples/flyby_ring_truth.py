@@ -32,15 +32,17 @@ from workflows.samples.write import Json
 SHARED = 8
 """Unknowns that are no radii: three of the whole scene, three of the rings alone, brightness and background."""
 CONVENTION = (
-    "kind ring: cramer_rao_*: of the whole scene without texture, rings_alone: of the rings' edges without bodies; "
+    "kind ring: cramer_rao_*: of the rings' edges and of smooth bodies, rings_alone: of the edges without bodies; "
     "both with an unknown radius of every feature within its sigma_a_km, an unknown brightness and background, and, "
     "where a rotation is fitted, its prior. observable_dv, observable_du: unit vector of the direction that is known "
     "best, whose sigma is *_along_px, the other direction's *_across_px; observable_directions: how many of them are "
     "below 0.5 px; null: nothing is known. n_edges: edges whose own place could be found to 0.25 px; features: true "
     "a_km of theirs, that of a moved one included. opening_deg: from the ring plane to the spacecraft, "
-    "opening_sun_deg: to the Sun, both positive to the north. kind ring_radius_trap: moved_feature lies moved_km beyond its own error"
+    "opening_sun_deg: to the Sun, both positive to the north. kind ring_radius_trap: moved_feature lies moved_km "
+    "beyond its own error"
 )
-WHOLE, RINGS, WHOLE_AND_LEVELS = (0, 1, 2), (3, 4, 5), (0, 1, 2, 6, 7)
+WHOLE, RINGS = (0, 1, 2), (3, 4, 5)
+BODIES_AND_LEVELS = (0, 1, 2, 6, 7)
 REACH_SIGMA = 4.0
 SEEN_PX = 0.25
 """An edge counts as seen if its own place along its normal could be found to this."""
@@ -97,9 +99,9 @@ def edge_slopes(s, d, here, radius, slope, sigma_px, factor, index, value):  # t
 def gather_information(s, d, across, radii, columns, weight, owner, sigma_px, factor, middle, features):  # type: ignore[no-untyped-def]
     """Information (n, n) on the shared unknowns and on the features' radii, and (edges,) on each edge's own place.
 
-    columns are the derivatives (5, rows, columns) with respect to dv, du, rotation, brightness and background of the
-    whole scene, whose information among themselves is left out; weight is one over the variance, zero where a pixel
-    does not count.
+    columns are the derivatives (5, rows, columns) with respect to dv, du and rotation of the bodies, and brightness
+    and background of the scene; their information among themselves is left out. weight is one over the variance, zero
+    where a pixel does not count.
     """
     information = np.zeros((SHARED + features, SHARED + features))
     alone = np.zeros(d.edges.shape[1])
@@ -121,7 +123,7 @@ def gather_information(s, d, across, radii, columns, weight, owner, sigma_px, fa
                 alone[index[k]] += weight[row, column] * (value[k] * slope) ** 2
                 places[SHARED + k], numbers[SHARED + k] = SHARED + owner[index[k]], value[k]
             for k in range(5):
-                numbers[WHOLE_AND_LEVELS[k]] = columns[k, row, column]
+                numbers[BODIES_AND_LEVELS[k]] = columns[k, row, column]
             # The light depends on the radius less the edge's: rings that move along v carry it against the gradient.
             numbers[3], numbers[4] = own * slope_v, own * slope_u
             numbers[5] = numbers[3] * (column - middle[1]) - numbers[4] * (row - middle[0])
@@ -203,7 +205,11 @@ def ring_information(shot: Shot, scene: Scene, disc: RingDisc, useless: NDArray[
         optics.centre_vu, len(FEATURES),
     )  # fmt: skip
     flat = columns.reshape(len(columns), -1)
-    information[np.ix_(WHOLE_AND_LEVELS, WHOLE_AND_LEVELS)] = (flat * weight.ravel()) @ flat.T
+    information[np.ix_(BODIES_AND_LEVELS, BODIES_AND_LEVELS)] = (flat * weight.ravel()) @ flat.T
+    # The whole scene moves as one: its derivatives are the bodies' and the rings' together.
+    together = np.eye(len(information))
+    together[:3, 3:6] = np.eye(3)
+    information = together @ information @ together.T
     prior = np.concatenate([np.zeros(SHARED), [1.0 / f.sigma_a_km**2 for f in FEATURES]])
     return information, alone, prior
 
