@@ -18,10 +18,12 @@ from pipeline.geometry.rotations import rotation_about
 from pipeline.options import Options
 from pipeline.records import BoolArray, FloatArray, Record
 
-_STEPS = 25
-# Rounds in which outliers are only weighted down, before any is rejected.
-_SOFT_ROUNDS = 4
+_STEPS = 40
+# Rounds at most in which outliers are only weighted down, before any is rejected.
+_SOFT_ROUNDS = 15
 _HUBER_SIGMAS = 1.5
+# Median of a chi-square of two degrees of freedom.
+_MEDIAN_CHI2 = 2.0 * float(np.log(2.0))
 # An update shorter than this share of its own sigma changes nothing.
 _SETTLED_SIGMAS = 1e-4
 # A scaled eigenvalue below this says that the landmarks alone do not see a direction.
@@ -155,53 +157,76 @@ def update_state(
     LandmarkState or str
         Updated state, or why there is none.
     """
-    place, place_covariance, observed, covariance = matches
+    place, _, observed, _ = matches
     n = len(place)
     if n < options.least_landmarks:
         return f"{n} landmarks"
     prior = _prior_information(prior_covariance, view.camera_from_body)
-    weight, used = np.ones(n), np.ones(n, bool)
+    weight, used, soft = np.ones(n), np.ones(n, bool), True
     limit = float(chdtri(2, options.outlier_chance))
     now, settled, step = view, False, 0
-    normal, middle = prior, np.zeros((6, 6))
     for step in range(1, _STEPS + 1):
-        if not (project(view.camera, (place - now.position_km) @ now.camera_from_body.T)[1]).all():
+        if not project(view.camera, (place - now.position_km) @ now.camera_from_body.T)[1].all():
             return "a landmark came to lie behind the camera"
-        partials, by_place = state_partials(now, place)
-        residual = observed - now.pixels(place)[0]
-        from_place = by_place @ place_covariance @ by_place.transpose(0, 2, 1)
-        total = covariance + from_place
-        chosen = np.linalg.inv(total if options.landmark_errors == "solve" else covariance)
-        weights = chosen * (weight * used)[:, None, None]
-        normal = np.einsum("nia,nij,njb->ab", partials, weights, partials) + prior
-        behind = np.concatenate(
-            [view.position_km - now.position_km, -_angle_between(view.camera_from_body, now.camera_from_body)]
-        )
-        update = np.linalg.pinv(normal, hermitian=True) @ (
-            np.einsum("nia,nij,nj->a", partials, weights, residual) + prior @ behind
-        )
-        middle = np.einsum("nia,nij,njk,nkl,nlb->ab", partials, weights, from_place, weights, partials)
+        sums = _normal_equations(now, view, matches, weight * used, prior, options)
+        update = np.linalg.pinv(sums.normal, hermitian=True) @ sums.right
         now = replace(
             now, position_km=now.position_km + update[:3], camera_from_body=turned(now.camera_from_body, update[3:])
         )
-        distance2 = np.einsum("ni,nij,nj->n", residual, np.linalg.inv(total), residual)
-        soft = step <= _SOFT_ROUNDS
-        weight = np.minimum(1.0, _HUBER_SIGMAS / np.sqrt(np.maximum(distance2, 1e-12))) if soft else np.ones(n)
-        settled = float(update @ normal @ update) < _SETTLED_SIGMAS**2
-        if not soft and settled:
-            keep = distance2 <= limit
+        settled = float(update @ sums.normal @ update) < _SETTLED_SIGMAS**2
+        if soft:
+            # Half of the landmarks tell the scale while the state is still far away.
+            scaled = sums.distance2 / max(1.0, float(np.median(sums.distance2)) / _MEDIAN_CHI2)
+            weight = np.minimum(1.0, _HUBER_SIGMAS / np.sqrt(np.maximum(scaled, 1e-12)))
+            soft = not (settled or step >= _SOFT_ROUNDS)
+            if not soft:
+                weight, used = np.ones(n), scaled <= limit
+        elif settled:
+            keep = sums.distance2 <= limit
             if np.array_equal(keep, used):
                 break
             used = keep
-            if used.sum() < options.least_landmarks:
-                return f"{int(used.sum())} of {n} landmarks agree"
-    return _state(now, (place, observed), (partials, weights, normal, middle), used, (step, settled), options)
+        if used.sum() < options.least_landmarks:
+            return f"{int(used.sum())} of {n} landmarks agree"
+    residual = observed - now.pixels(place)[0]
+    return LandmarkState(now, _covariance(sums, now, options), residual, used, _seen(sums), step, settled)
+
+
+@dataclass(frozen=True, eq=False)
+class _Sums:
+    """Normal equations at one state."""
+
+    normal: FloatArray
+    alone: FloatArray
+    right: FloatArray
+    considered: FloatArray
+    distance2: FloatArray
+
+
+def _normal_equations(
+    now: MapletView, start: MapletView, matches: tuple[FloatArray, FloatArray, FloatArray, FloatArray],
+    weight: FloatArray, prior: FloatArray, options: LandmarkStateOptions,
+) -> _Sums:  # fmt: skip
+    place, place_covariance, observed, covariance = matches
+    partials, by_place = state_partials(now, place)
+    residual = observed - now.pixels(place)[0]
+    from_place = by_place @ place_covariance @ by_place.transpose(0, 2, 1)
+    total = np.linalg.inv(covariance + from_place)
+    chosen = total if options.landmark_errors == "solve" else np.linalg.inv(covariance)
+    weights = chosen * weight[:, None, None]
+    alone = np.einsum("nia,nij,njb->ab", partials, weights, partials)
+    behind = np.concatenate(
+        [start.position_km - now.position_km, -_angle_between(start.camera_from_body, now.camera_from_body)]
+    )
+    right = np.einsum("nia,nij,nj->a", partials, weights, residual) + prior @ behind
+    considered = np.einsum("nia,nij,njk,nkl,nlb->ab", partials, weights, from_place, weights, partials)
+    return _Sums(alone + prior, alone, right, considered, np.einsum("ni,nij,nj->n", residual, total, residual))
 
 
 def _prior_information(covariance: FloatArray, camera_from_body: FloatArray) -> FloatArray:
     """Information of the a-priori state in (position, dtheta); zero for what is not known.
 
-    ``r = T' dtheta`` (T' = body from camera), so that dtheta = T r.
+    See :func:`_into_body` for the signs.
     """
     known = np.isfinite(np.diag(covariance))
     information = np.zeros((6, 6))
@@ -211,24 +236,21 @@ def _prior_information(covariance: FloatArray, camera_from_body: FloatArray) -> 
 
 
 def _into_body(camera_from_body: FloatArray) -> FloatArray:
-    turn = np.eye(6)
+    """From what a state lacks to its error: ``dp = -(lacking position)``, but ``r = T' dtheta``."""
+    turn = -np.eye(6)
     turn[3:, 3:] = camera_from_body.T
     return turn
 
 
-def _state(
-    now: MapletView, matches: tuple[FloatArray, FloatArray], sums: tuple[FloatArray, ...], used: BoolArray,
-    ended: tuple[int, bool], options: LandmarkStateOptions,
-) -> LandmarkState:  # fmt: skip
-    place, observed = matches
-    partials, weights, normal, middle = sums
-    covariance = np.linalg.pinv(normal, hermitian=True)
+def _covariance(sums: _Sums, now: MapletView, options: LandmarkStateOptions) -> FloatArray:
+    covariance = np.linalg.pinv(sums.normal, hermitian=True)
     if options.landmark_errors == "consider":
-        covariance = covariance + covariance @ middle @ covariance
-    alone = np.einsum("nia,nij,njb->ab", partials, weights, partials)
-    scale = np.sqrt(np.maximum(np.diag(alone), 1e-300))
-    seen = int((np.linalg.eigvalsh(alone / np.outer(scale, scale)) > _BLIND).sum())
+        covariance = covariance + covariance @ sums.considered @ covariance
     turn = _into_body(now.camera_from_body)
-    return LandmarkState(
-        now, turn @ covariance @ turn.T, observed - now.pixels(place)[0], used, seen, ended[0], ended[1]
-    )
+    return np.asarray(turn @ covariance @ turn.T)
+
+
+def _seen(sums: _Sums) -> int:
+    """Directions that the landmarks alone see, on a scale on which each parameter by itself counts one."""
+    scale = np.sqrt(np.maximum(np.diag(sums.alone), 1e-300))
+    return int((np.linalg.eigvalsh(sums.alone / np.outer(scale, scale)) > _BLIND).sum())

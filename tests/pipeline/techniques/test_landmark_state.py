@@ -58,7 +58,7 @@ def test_eq_2_27_updates_are_exact_rotations() -> None:
     assert after == pytest.approx(exp(-dtheta) @ TURN)
     skew = np.cross(np.eye(3), dtheta)
     small = turned(TURN, 1e-6 * dtheta)
-    assert small == pytest.approx((np.eye(3) + 1e-6 * skew) @ TURN, abs=1e-12)
+    assert small == pytest.approx((np.eye(3) - 1e-6 * skew) @ TURN, abs=1e-12)
 
 
 def trial(
@@ -121,7 +121,8 @@ def test_solving_landmarks_along_is_the_full_least_squares() -> None:
         row[:, :6], row[:, 6 + 3 * k : 9 + 3 * k] = partials[k], by_place[k]
         full += row.T @ weight @ row
         full[6 + 3 * k : 9 + 3 * k, 6 + 3 * k : 9 + 3 * k] += np.eye(3) / 0.03**2
-    into_body = np.eye(6)
+    # dp is the estimate less the truth, the other way round than what is to be added.
+    into_body = -np.eye(6)
     into_body[3:, 3:] = found.view.camera_from_body.T
     full[:6, :6] += into_body.T @ np.linalg.inv(PRIOR) @ into_body
     expected = into_body @ np.linalg.inv(full)[:6, :6] @ into_body.T
