@@ -58,6 +58,9 @@ class ArchiveDescription(Options):
     rings: str | None = Field(
         None, min_length=1, description="ring catalogue (YAML), relative to the root; wins for its planet"
     )
+    maplets: dict[str, str] = Field(
+        default_factory=dict, description="maplet catalogues by body, folders relative to the root, local files only"
+    )
     bodies: dict[str, BodyBlock] = Field(
         default_factory=dict, description="what this archive knows of bodies, by name; wins key by key"
     )

@@ -4,6 +4,7 @@ One group holds the maplets of one size. A catalogue is a folder: ``maplets.zarr
 came with the maps.
 """
 
+import hashlib
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -147,6 +148,29 @@ def open_catalog(folder: Path) -> MapletCatalog:
     if not groups:
         raise MapletCatalogProblem(f"{folder} holds no maplets")
     return MapletCatalog(folder, groups)
+
+
+def catalog_digest(folder: Path) -> str:
+    """Digest of a catalogue without reading its height fields.
+
+    Parameters
+    ----------
+    folder
+        That :func:`write_catalog` wrote.
+
+    Returns
+    -------
+    str
+        sha256 over the names and sizes of all files, and the content of those that hold no heights or albedos.
+    """
+    digest = hashlib.sha256()
+    store = folder / STORE
+    for path in sorted(path for path in store.rglob("*") if path.is_file()):
+        parts = path.relative_to(store).parts
+        digest.update(f"{'/'.join(parts)}:{path.stat().st_size};".encode())
+        if not {"heights", "albedo"} & set(parts):
+            digest.update(path.read_bytes())
+    return digest.hexdigest()
 
 
 def write_catalog(folder: Path, entries: Iterable[tuple[str, MapFile, LandmarkFile | None]]) -> int:

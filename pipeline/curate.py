@@ -16,6 +16,7 @@ from pipeline.predict.rings import RingFate
 from pipeline.records import FloatArray, State
 from pipeline.status import Rank, Status, StatusReason, status_of
 from pipeline.techniques.base import FeatureTable, TechniqueFailure, TechniqueResult, covariance_of
+from pipeline.techniques.landmark_table import LandmarkTable
 from pipeline.techniques.ring_edges import RingEdgeTable
 
 Json = str | int | float | bool | None | list["Json"] | dict[str, "Json"]
@@ -107,6 +108,7 @@ def build_metadata_dict(
     document["bodies"] = [_body(fate) for fate in navigation.bodies]
     document["rings"] = [_ring(fate) for fate in navigation.rings]
     document["ring_edges"] = None if navigation.ring_edges is None else _ring_edges(navigation.ring_edges)
+    document["landmarks"] = None if navigation.landmarks is None else _landmarks(navigation.landmarks)
     document["frame"] = None if navigation.frame is None else _frame_figures(navigation.frame)
     answers: list[Json] = [_technique(result, estimate) for result in navigation.results]
     document["techniques"] = [*answers, *(_failure(failure) for failure in navigation.failures)]
@@ -141,7 +143,8 @@ def error_document(
         "schema": SCHEMA, "image_id": image_id, "mission": "UNKNOWN", "camera": "UNKNOWN", "time_utc": None, "et": None,
         "exposure_s": None, "status": status.value, "status_reason": reason.value, "detail": detail,
         "rank": Rank.FAILED.value, "confidence": None, "offset_px": None, "sigma_px": None, "covariance_px2": None,
-        "observable": None, "pointing": None, "bodies": [], "rings": [], "ring_edges": None, "frame": None,
+        "observable": None, "pointing": None, "bodies": [], "rings": [], "ring_edges": None, "landmarks": None,
+        "frame": None,
         "techniques": [], "label": label,
         "provenance": _provenance(provenance),
     }  # fmt: skip
@@ -252,6 +255,28 @@ def _ring_edges(table: RingEdgeTable) -> dict[str, Json]:
         "radius_km", "longitude_deg", "sigma_km", "predicted_km", "v_px", "u_px", "sigma_px", "contrast_dn", "weight",
     ):  # fmt: skip
         columns[name] = _numbers(getattr(table, name), digits.get(name, 6))
+    return columns
+
+
+def _landmarks(table: LandmarkTable) -> dict[str, Json]:
+    """Columns of the landmarks: predicted, observed, and what was in between."""
+    offset, covariance = table.observed_vu - table.predicted_vu, table.covariance_px2
+    columns: dict[str, Json] = {
+        "landmark": table.name.tolist(), "status": table.status.tolist(), "used": table.used.tolist(),
+        "bin": table.bin_size.tolist(),
+    }  # fmt: skip
+    reals = {
+        "predicted_v_px": table.predicted_vu[:, 0], "predicted_u_px": table.predicted_vu[:, 1],
+        "observed_v_px": table.observed_vu[:, 0], "observed_u_px": table.observed_vu[:, 1],
+        "offset_dv_px": offset[:, 0], "offset_du_px": offset[:, 1],
+        "sigma_dv_px": np.sqrt(covariance[:, 0, 0]), "sigma_du_px": np.sqrt(covariance[:, 1, 1]),
+        "cov_dv_du_px2": covariance[:, 0, 1], "correlation": table.correlation, "incidence_deg": table.incidence_deg,
+        "emission_deg": table.emission_deg, "cells_per_pixel": table.ratio,
+    }  # fmt: skip
+    for name, values in reals.items():
+        columns[name] = _numbers(values, _PIXEL_DIGITS + 1)
+    for axis, name in enumerate(("x_km", "y_km", "z_km")):
+        columns[name] = _numbers(table.landmark_km[:, axis])
     return columns
 
 

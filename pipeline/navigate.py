@@ -25,6 +25,7 @@ from pipeline.techniques.body_limb import (
     body_limb_nav,
     body_terminator_nav,
 )
+from pipeline.techniques.landmark_table import LandmarkTable
 from pipeline.techniques.ring_annulus import RingAnnulusOptions, ring_annulus_nav
 from pipeline.techniques.ring_edge import RingEdgeOptions, ring_edge_nav
 from pipeline.techniques.ring_edges import RingEdgeTable, ring_edge_table
@@ -33,6 +34,7 @@ from pipeline.techniques.ring_search import RingFix, find_rings
 from pipeline.techniques.star_field import StarFieldOptions, star_field_nav
 from pipeline.techniques.star_refine import StarRefineOptions, star_refine_nav
 from pipeline.techniques.star_unique import StarUniqueOptions, star_unique_nav
+from pipeline.techniques.surface_features import MapletSource, SurfaceFeatureOptions, surface_feature_nav
 
 
 class TechniquesOptions(Options):
@@ -47,6 +49,7 @@ class TechniquesOptions(Options):
     BodyBlobNav: BodyBlobOptions = BodyBlobOptions()
     RingEdgeNav: RingEdgeOptions = RingEdgeOptions()
     RingAnnulusNav: RingAnnulusOptions = RingAnnulusOptions()
+    SurfaceFeatureNav: SurfaceFeatureOptions = SurfaceFeatureOptions()
 
 
 class NavigationOptions(Options):
@@ -83,6 +86,8 @@ class Navigation:
         What became of each feature of its rings.
     ring_edges
         Measured radii, None without a fit of rings.
+    landmarks
+        Landmarks looked for, None where none can be seen.
     """
 
     state: State
@@ -95,6 +100,7 @@ class Navigation:
     bodies: tuple[BodyFate, ...] = ()
     rings: tuple[RingFate, ...] = ()
     ring_edges: RingEdgeTable | None = None
+    landmarks: LandmarkTable | None = None
 
 
 StageListener = Callable[[str], None]
@@ -108,6 +114,7 @@ def navigate(
     stars: StarTable,
     options: NavigationOptions,
     on_stage: StageListener = lambda stage: None,
+    maplets: tuple[MapletSource, ...] = (),
 ) -> Navigation:
     """Navigate one image.
 
@@ -125,6 +132,8 @@ def navigate(
         All stages' options.
     on_stage
         Called with a stage's name when that stage has ended; clocks live with the caller.
+    maplets
+        Maplets of bodies; the nearest body in the State that has some is looked at.
 
     Returns
     -------
@@ -157,7 +166,11 @@ def navigate(
         ring_fix, answers = _ring_pass(rings, without_spikes(frame), fix, context, options.techniques)
         outcomes += answers
         on_stage("rings")
-    if len(predicted) or not (len(scene) or len(rings)):
+    landmark_outcomes, landmarks = _landmark_pass(maplets, frame, state, options.techniques.SurfaceFeatureNav)
+    if landmark_outcomes:
+        outcomes += landmark_outcomes
+        on_stage("landmarks")
+    if len(predicted) or not (len(scene) or len(rings) or landmark_outcomes):
         outcomes += _first_pass(predicted, star_frame, context, options, on_stage)
     first = _fuse(outcomes, context, state, options)
     usable = first is not None and first.reason in (StatusReason.NAVIGATED, StatusReason.NAVIGATED_AT_EDGE)
@@ -168,8 +181,21 @@ def navigate(
     on_stage("ensemble")
     edges = _ring_edges(rings, ring_fix, estimate)
     return replace(
-        _conclude(state, frame, estimate, outcomes), bodies=scene.fates, rings=rings.fates, ring_edges=edges
-    )
+        _conclude(state, frame, estimate, outcomes), bodies=scene.fates, rings=rings.fates, ring_edges=edges,
+        landmarks=landmarks,
+    )  # fmt: skip
+
+
+def _landmark_pass(
+    maplets: tuple[MapletSource, ...], frame: Frame, state: State, options: SurfaceFeatureOptions
+) -> tuple[list[_Outcome], LandmarkTable | None]:
+    """Landmarks of the nearest body that has a catalogue of them."""
+    by_name = {source.body.upper(): source for source in maplets}
+    body = next((body for body in state.bodies if body.name.upper() in by_name), None)
+    if body is None or not options.enabled:
+        return [], None
+    answer, table = surface_feature_nav(body, by_name[body.name.upper()], frame, state, options)
+    return [answer], table
 
 
 def _ring_pass(

@@ -106,6 +106,29 @@ SCHEMAS: dict[str, pa.Schema] = {
         _field("contrast_dn", _REAL, "DN", "brightness outside less inside"),
         _field("weight", _REAL, "", "robust weight in the fit, 0 where the sample was not believed"),
     ]),
+    "landmarks": pa.schema([
+        *_IDENTITY,
+        _field("landmark", _TEXT, "", "name in the maplet catalogue"),
+        _field("status", _TEXT, "", "found, or why not: a correlation's end or a criterion of removal"),
+        _field("used", _FLAG, "", "took part in the fit"),
+        _field("predicted_v_px", _REAL, _PIXEL, "under the a-priori geometry"),
+        _field("predicted_u_px", _REAL, _PIXEL, "under the a-priori geometry"),
+        _field("observed_v_px", _REAL, _PIXEL, "null where not found"),
+        _field("observed_u_px", _REAL, _PIXEL, "null where not found"),
+        _field("offset_dv_px", _REAL, _PIXEL, "observed minus predicted"),
+        _field("offset_du_px", _REAL, _PIXEL, "observed minus predicted"),
+        _field("sigma_dv_px", _REAL, _PIXEL, "1 sigma of the observation, the landmark's own place aside"),
+        _field("sigma_du_px", _REAL, _PIXEL, "1 sigma of the observation, the landmark's own place aside"),
+        _field("cov_dv_du_px2", _REAL, "px2", "covariance of the two"),
+        _field("correlation", _REAL, "", "at the peak of the last correlation"),
+        _field("bin", pa.int64(), "cells", "bin of the last correlation"),
+        _field("incidence_deg", _REAL, "deg", "Sun from the maplet's mean normal"),
+        _field("emission_deg", _REAL, "deg", "camera from the maplet's mean normal"),
+        _field("cells_per_pixel", _REAL, "", "resolution ratio: above 1 the maplet is finer than the picture"),
+        _field("x_km", _REAL, "km", "landmark, body-fixed"),
+        _field("y_km", _REAL, "km", "landmark, body-fixed"),
+        _field("z_km", _REAL, "km", "landmark, body-fixed"),
+    ]),
     "timings": pa.schema([
         *_IDENTITY,
         _field("stage", _TEXT, "", "stage of the pipeline, or total"),
@@ -247,25 +270,27 @@ def feature_columns(documents: Iterable[Mapping[str, Json]]) -> dict[str, list[J
     return columns
 
 
-def ring_edge_columns(documents: Iterable[Mapping[str, Json]]) -> dict[str, list[Json]]:
-    """Columns of table ``ring_edges`` for many images.
+def block_columns(documents: Iterable[Mapping[str, Json]], table: str) -> dict[str, list[Json]]:
+    """Columns of a table that images keep as one block of columns under its name: ``ring_edges``, ``landmarks``.
 
     Parameters
     ----------
     documents
         Images' JSON documents.
+    table
+        Name.
 
     Returns
     -------
     dict
         One list per column, all of one length.
     """
-    columns: dict[str, list[Json]] = {name: [] for name in SCHEMAS["ring_edges"].names}
+    columns: dict[str, list[Json]] = {name: [] for name in SCHEMAS[table].names}
     for document in documents:
-        edges = document.get("ring_edges")
-        if not isinstance(edges, dict):
+        block = document.get(table)
+        if not isinstance(block, dict):
             continue
-        count = len(edges["feature"])  # type: ignore[arg-type]
+        count = len(block[next(iter(block))])  # type: ignore[arg-type]
         for name, values in columns.items():
-            values.extend(edges[name] if name in edges else [document[name]] * count)  # type: ignore[arg-type]
+            values.extend(block[name] if name in block else [document[name]] * count)  # type: ignore[arg-type]
     return columns

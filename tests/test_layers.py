@@ -30,7 +30,7 @@ FOUNDATIONS = {
     "geometry": ("rotations", "shape", "rays", "maplet"),
     "imaging": ("psf", "illumination", "render"),
     "pose": ("records", "se3", "normalise", "refine", "pnp", "ransac", "graph", "estimator", "triangulation", "views", "bundle", "arc_factors", "arcs"),
-    "predict": ("bodies", "maplets"),
+    "predict": ("body_view", "bodies", "maplets"),
     "techniques": (
         "base", "star_fit", "star_match", "star_search", "star_inventory", "body_base", "body_search", "model_errors",
         "template_fit", "body_minor", "contour_fit", "lm", "line_search", "relief", "ring_units", "ring_solve", "ring_fit",

@@ -32,6 +32,7 @@ _TABLES = {
     "techniques": "One row per technique that ran on an image, about the technique's own pivot.",
     "features": "One row per predicted feature, technique and image.",
     "ring_edges": "One row per measured piece of a ring's edge and image, some 24 pixels long.",
+    "landmarks": "One row per landmark looked for and image.",
     "timings": "One row per stage and image, and one for the total.",
 }
 

@@ -33,6 +33,7 @@ from pipeline.curate import Json
 from pipeline.errors import ConfigurationError
 from pipeline.options import InstrumentSettings
 from workflows.config import Configuration
+from workflows.maplet_sources import MapletFolder, find_maplets
 from workflows.store import RunFolder, read_json
 
 PER_IMAGE = "per-image"
@@ -63,6 +64,8 @@ class Setup:
         SPICE kernels in the order of loading.
     rings
         Ring catalogues, the archive's own last.
+    maplets
+        Maplet catalogues.
     """
 
     archive: Archive
@@ -74,6 +77,7 @@ class Setup:
     software: str
     kernels: tuple[Kernel, ...] = ()
     rings: tuple[RingCatalog, ...] = ()
+    maplets: tuple[MapletFolder, ...] = ()
 
     def inputs_of(self, ref: ImageRef) -> tuple[str, ...]:
         """Paths, relative to the archive, whose bytes decide an image's answer."""
@@ -104,6 +108,7 @@ class Setup:
         parts: list[object] = [
             self.configuration.digest(), self.software, description, bodies, list(self.star_digests), kernels,
             [catalog.model_dump(mode="json") for catalog in self.rings],
+            [(folder.body, folder.sha256) for folder in self.maplets],
         ]  # fmt: skip
         return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
 
@@ -160,7 +165,7 @@ def make_plan(archive: Archive, configuration: Configuration, run_folder: RunFol
     setup = Setup(
         archive, configuration, tuple(index.path for index in indexes),
         tuple((index.name, index.sha256) for index in indexes), per_image, run_folder, software_id(),
-        open_kernels(archive, configuration, verify), open_rings(archive),
+        open_kernels(archive, configuration, verify), open_rings(archive), find_maplets(archive),
     )  # fmt: skip
     every = list_images(archive, configuration.instruments)
     todo = [ref for ref in every if not _is_done(ref, setup, verify)]

@@ -16,7 +16,7 @@ import pyarrow.parquet as pq
 
 from pipeline.curate import Json
 from pipeline.errors import ConfigurationError
-from pipeline.tables import SCHEMAS, feature_columns, offset_row, ring_edge_columns, technique_rows
+from pipeline.tables import SCHEMAS, block_columns, feature_columns, offset_row, technique_rows
 
 # Images whose rows are written together: bounds memory and fixes the row groups whatever the worker count.
 _IMAGES_PER_GROUP = 2000
@@ -244,8 +244,8 @@ def _columns(folder: RunFolder, table: str, image_ids: Iterable[str]) -> dict[st
     documents = [d for d in (read_json(folder.document(image_id)) for image_id in image_ids) if d is not None]
     if table == "features":
         return feature_columns(documents)
-    if table == "ring_edges":
-        return ring_edge_columns(documents)
+    if table in ("ring_edges", "landmarks"):
+        return block_columns(documents, table)
     if table == "offsets":
         rows = [offset_row(document) for document in documents]
     elif table == "techniques":

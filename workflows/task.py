@@ -32,6 +32,7 @@ from pipeline.navigate import Navigation, navigate
 from pipeline.predict.stars import reach_px
 from pipeline.records import BoolArray, StarTable, State, TriangleMesh
 from pipeline.status import StatusReason
+from workflows.maplet_sources import Maplets
 from workflows.plan import Setup
 from workflows.store import to_json, write_atomically
 
@@ -191,6 +192,7 @@ class ImageRunner:
         self._options = setup.configuration.navigation()
         self._config_digest = setup.configuration.digest()
         self._meshes = Meshes(setup.archive)
+        self._maplets = Maplets(setup.maplets)
         self._known_bodies = load_bodies(setup.kernels) if setup.kernels else ()
 
     def run(self, ref: ImageRef) -> Outcome:
@@ -251,7 +253,9 @@ class ImageRunner:
         watch.lap("geometry")
         stars = self._stars(ref, state, inputs)
         watch.lap("catalog")
-        navigation: Navigation = navigate(raw.pixels, _flags(raw, block), state, stars, self._options, watch.lap)
+        navigation: Navigation = navigate(
+            raw.pixels, _flags(raw, block), state, stars, self._options, watch.lap, self._maplets.sources(state)
+        )
         rank = self._setup.configuration.orchestrator.rank
         return build_metadata_dict(navigation, rank, self._provenance(ref, inputs, source), label.document())
 
@@ -301,7 +305,8 @@ class ImageRunner:
     def _provenance(self, ref: ImageRef, inputs: Inputs, source: str | None) -> Provenance:
         sidecar = inputs.digests.get(stem(ref.path) + SIDECAR_SUFFIX)
         table = inputs.digests.get(stem(ref.path) + STARS_SUFFIX)
-        catalogs = (*self._setup.star_digests, *((("per-image", table),) if table else ()))
+        maplets = ((f"maplets of {folder.body}", folder.sha256) for folder in self._setup.maplets)
+        catalogs = (*self._setup.star_digests, *((("per-image", table),) if table else ()), *maplets)
         image = inputs.digests.get(ref.path)
         listed = set(self._setup.inputs_of(ref))
         shapes = ((name, sha256) for name, sha256 in sorted(inputs.digests.items()) if name not in listed and sha256)

@@ -227,7 +227,7 @@ def _answer(
     return TechniqueResult(
         technique=NAME, offset_vu=fit.offset_vu, rotation_rad=fit.rotation_rad, information=fit.information,
         pivot_vu=fit.pivot_vu, confidence=_confidence(agreeing, table, context), measurements=agreeing,
-        at_edge=at_edge, at_edge_rotation=at_edge_rotation, error_sources=(f"shape of {body.name}",),
+        at_edge=at_edge, at_edge_rotation=at_edge_rotation, error_sources=(f"body:{body.name}",),
         diagnostics={
             "landmarks_used": int(fit.inlier.sum()), "landmarks_looked_for": len(table),
             "extra_sigma_px": fit.extra_sigma_px, "alignment_correlation": alignment.correlation,
