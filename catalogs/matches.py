@@ -64,6 +64,35 @@ class MatchTable(Record):
 
 
 @dataclass(frozen=True)
+class ArcView:
+    """One view of an arc: its time, what was believed of its pose, and whether its compute budget was short."""
+
+    view_id: int
+    et: float
+    prior: Pose
+    throttled: bool
+
+
+@dataclass(frozen=True)
+class Arc:
+    """Views of one orbit, flyby or flight.
+
+    Attributes
+    ----------
+    arc_id
+        Name.
+    options
+        Fields of ``pipeline.pose.arcs.ArcOptions``.
+    views
+        In the order of time.
+    """
+
+    arc_id: str
+    options: dict[str, float]
+    views: tuple[ArcView, ...]
+
+
+@dataclass(frozen=True)
 class Cameras:
     """What ``cameras.json`` says.
 
@@ -75,11 +104,14 @@ class Cameras:
         Ellipsoid of the body.
     poses
         Given poses by view id, in the order of the file.
+    arcs
+        Arcs, if the file has any.
     """
 
     camera: CameraModel
     datum: Datum
     poses: dict[int, Pose]
+    arcs: tuple[Arc, ...] = ()
 
 
 def _text(names: tuple[str, ...] | list[str]) -> str:
@@ -165,7 +197,9 @@ def read_cameras(data: bytes, name: str) -> Cameras:
     ----------
     data
         ``{K, shape_vu, views: [{view_id, position_km, camera_from_body}], datum: {name, radii_km}}``; K maps (x, y, 1)
-        to (u, v, 1). In the place of K, ``camera_model`` as in a sidecar. Without a datum WGS 84 is meant.
+        to (u, v, 1). In the place of K, ``camera_model`` as in a sidecar. Without a datum WGS 84 is meant. Optional
+        ``arcs: [{arc_id, options, views: [{view_id, et, position_km, camera_from_body, throttled}]}]`` with what was
+        believed of each pose.
     name
         For messages.
 
@@ -186,6 +220,7 @@ def read_cameras(data: bytes, name: str) -> Cameras:
         doubled = len(poses) < len(views)
         datum = Datum(content["datum"]["name"], content["datum"]["radii_km"]) if "datum" in content else wgs84()
         camera = _camera(content)
+        arcs = tuple(_arc(arc) for arc in content.get("arcs", []))
     except (ValueError, TypeError, KeyError) as error:
         what = f"no {error}" if isinstance(error, KeyError) else str(error)
         raise ConfigurationError(f"{name}: {what}") from error
@@ -193,7 +228,7 @@ def read_cameras(data: bytes, name: str) -> Cameras:
         raise ConfigurationError(f"{name}: {error}") from error
     if doubled:
         raise ConfigurationError(f"{name}: a view is given twice")
-    return Cameras(camera, datum, poses)
+    return Cameras(camera, datum, poses, arcs)
 
 
 def _pose(view: dict[str, FloatArray]) -> Pose:
@@ -205,6 +240,15 @@ def _pose(view: dict[str, FloatArray]) -> Pose:
         return Pose(turn, place)
     except MatchError as error:
         raise MatchError(f"view {view['view_id']}: {error}") from error
+
+
+def _arc(arc: dict[str, FloatArray]) -> Arc:
+    views: list[dict[str, FloatArray]] = arc["views"]  # type: ignore[assignment]
+    options: dict[str, float] = dict(arc.get("options", {}))  # type: ignore[call-overload]
+    return Arc(
+        str(arc["arc_id"]), options,
+        tuple(ArcView(int(v["view_id"]), float(v["et"]), _pose(v), bool(v.get("throttled", False))) for v in views),
+    )  # fmt: skip
 
 
 def _camera(content: dict[str, FloatArray]) -> CameraModel:

@@ -39,7 +39,7 @@ from pipeline.pose.views import (
 )
 from pipeline.records import FloatArray
 
-_UPPER = tuple((i, j) for i in range(6) for j in range(i, 6))
+UPPER = tuple((i, j) for i in range(6) for j in range(i, 6))
 _FRAME = (
     "x_cam = camera_from_body (X - position), quaternion of camera_from_body scalar first; cov: upper triangle by rows "
     "of the errors (x, y, z, rx, ry, rz), km and rad, body-fixed, position estimated minus true and "
@@ -73,11 +73,11 @@ class Budget:
     choice: CovarianceChoice
     seconds: float | None = None
 
-    def state(self, started: float) -> ThermalState:
-        """State of the budget now, for a run that started at a time of the monotonic clock."""
+    def state(self, started: float, throttled: bool) -> ThermalState:
+        """State of the budget now, for a run that started at a time of the monotonic clock and a view's own budget."""
         spent = self.seconds is not None and time.monotonic() - started > self.seconds
         return ThermalState(
-            self.choice is CovarianceChoice.JACOBIAN or (self.choice is CovarianceChoice.AUTO and spent)
+            self.choice is CovarianceChoice.JACOBIAN or (self.choice is CovarianceChoice.AUTO and (spent or throttled))
         )
 
 
@@ -101,6 +101,7 @@ class Views:
     calibration: CameraCalibration
     options: PoseOptions
     table: MatchTable
+    throttled: frozenset[int] = frozenset()
 
     def places(self, without: int | None = None) -> Intersections:
         """Places of all points: those of the file, else from the given views but one."""
@@ -147,13 +148,15 @@ def prepare(table: MatchTable, cameras: Cameras) -> Views:
     ConfigurationError
         If points have no places and fewer than two poses are given.
     """
-    named = np.concatenate([table.view_id, np.array(list(cameras.poses), dtype=np.int64)])
+    told = [*cameras.poses, *(view.view_id for arc in cameras.arcs for view in arc.views)]
+    named = np.concatenate([table.view_id, np.array(told, dtype=np.int64)])
     ids, view = _ranked(named)
     points, point = _ranked(table.point_id)
     sightings = Sightings(view[: len(table.view_id)], point, table.pixels_vu, table.pixel_covariance_px2)
     given = {int(np.searchsorted(ids, key)): pose for key, pose in cameras.poses.items()}
     calibration = CameraCalibration.of(cameras.camera, cameras.datum)
-    plain = Views(ids, points, sightings, given, False, calibration, PoseOptions(), table)
+    throttled = frozenset(view.view_id for arc in cameras.arcs for view in arc.views if view.throttled)
+    plain = Views(ids, points, sightings, given, False, calibration, PoseOptions(), table, throttled)
     if table.points_km is not None:
         return plain
     if len(given) < 2:
@@ -166,7 +169,7 @@ def prepare(table: MatchTable, cameras: Cameras) -> Views:
         if places.ok.any():
             sigma = sigma_of(cameras.camera, sightings, given, places.places_km)
             options = PoseOptions(assumed_sigma_px=max(sigma, 1e-6))
-    return Views(ids, points, sightings, given, away, calibration, options, table)
+    return Views(ids, points, sightings, given, away, calibration, options, table, throttled)
 
 
 def solve_views(views: Views, budget: Budget, every: bool) -> Iterable[PoseRow]:
@@ -200,7 +203,8 @@ def solve_views(views: Views, budget: Budget, every: bool) -> Iterable[PoseRow]:
         with warnings.catch_warnings():
             # The log has a line per throttled frame; Python's own warnings would say the first one only.
             warnings.simplefilter("ignore", CovarianceDegradedWarning)
-            yield PoseRow(int(view_id), solve_view(estimator, views.calibration, matches, budget.state(started)))
+            state = budget.state(started, int(view_id) in views.throttled)
+            yield PoseRow(int(view_id), solve_view(estimator, views.calibration, matches, state))
 
 
 def bundle_views(views: Views, rows: list[PoseRow], sigma_km: float, sigma_rad: float) -> list[PoseRow]:
@@ -286,7 +290,7 @@ def pose_table(views: Views, rows: list[PoseRow]) -> pa.Table:
         ``view_id, x_km, y_km, z_km, qw, qx, qy, qz, cov_00 ... cov_55, rms_px, label``; null where there is no pose.
     """
     names = ["view_id", "x_km", "y_km", "z_km", "qw", "qx", "qy", "qz"]
-    names += [f"cov_{i}{j}" for i, j in _UPPER] + ["rms_px", "label"]
+    names += [f"cov_{i}{j}" for i, j in UPPER] + ["rms_px", "label"]
     kinds = [pa.int64(), *[pa.float64()] * (len(names) - 2), pa.string()]
     meta = {"frame": _FRAME + (_TO_BODY if views.turned else "")}
     schema = pa.schema(list(zip(names, kinds, strict=True)), metadata=meta)
@@ -297,7 +301,7 @@ def pose_table(views: Views, rows: list[PoseRow]) -> pa.Table:
 def _values(row: PoseRow, turn: bool) -> list[int | float | str | None]:
     answer = row.answer
     if isinstance(answer, PnpFailureError):
-        return [row.view_id, *[None] * (7 + len(_UPPER) + 1), SourceLabel.DEAD_RECKONED.value]
+        return [row.view_id, *[None] * (7 + len(UPPER) + 1), SourceLabel.DEAD_RECKONED.value]
     pose, covariance = answer.pose, answer.covariance_6x6
     if turn:
         pose, covariance = turned(pose), SE3Utils.error_from_correction(covariance)
@@ -306,6 +310,6 @@ def _values(row: PoseRow, turn: bool) -> list[int | float | str | None]:
     numbers = [
         *pose.position_km,
         *quaternion_from_matrix(pose.camera_from_body),
-        *(covariance[i, j] for i, j in _UPPER),
+        *(covariance[i, j] for i, j in UPPER),
     ]
     return [row.view_id, *map(float, numbers), rms, answer.source_label.value]

@@ -21,6 +21,12 @@ def _read(path: Path) -> bytes:
         raise ConfigurationError(f"{path}: {error.strerror}") from error
 
 
+def _write(path: Path, table: pa.Table) -> None:
+    sink = pa.BufferOutputStream()
+    pq.write_table(table, sink)
+    write_atomically(path, sink.getvalue().to_pybytes())
+
+
 def pose(
     matches: Annotated[Path, typer.Argument(help="Parquet: view_id, point_id, v_px, u_px; places and covariances.")],
     cameras: Annotated[Path, typer.Option("--cameras", help="JSON: K and shape_vu or camera_model, views with poses.")],
@@ -33,6 +39,7 @@ def pose(
     bundle: Annotated[bool, typer.Option("--bundle", help="Then adjust all views and points together.")] = False,
     given_sigma_km: Annotated[float, typer.Option(min=1e-9, help="Of given positions, in the bundle.")] = 2.0,
     given_sigma_mrad: Annotated[float, typer.Option(min=1e-9, help="Of given attitudes, in the bundle.")] = 0.5,
+    arcs: Annotated[Path | None, typer.Option("--arcs", help="Folder for poses.parquet and arcs.parquet.")] = None,
     verbose: Annotated[bool, typer.Option("--verbose", "-v", help="A JSON line per view.")] = False,
 ) -> None:
     """Solve views from points of known place, or of places that views with given poses make known.
@@ -45,9 +52,10 @@ def pose(
 
     logging.basicConfig(level=logging.CRITICAL, format="%(message)s")
     logging.getLogger("pilotage.pose").setLevel(logging.DEBUG if verbose else logging.CRITICAL)
-    views = prepare(
-        read_matches(_read(matches), str(matches)), read_cameras(_read(cameras), str(cameras))
-    )  # fmt: skip
+    told = read_cameras(_read(cameras), str(cameras))
+    if arcs is not None and not told.arcs:
+        raise ConfigurationError(f"{cameras}: no arcs to smooth")
+    views = prepare(read_matches(_read(matches), str(matches)), told)
     if views.turned:
         typer.echo(
             f"{cameras}: the given cameras look away from their points; positions are read, and written, as vectors "
@@ -61,9 +69,14 @@ def pose(
     failed = [row for row in rows if isinstance(row.answer, PnpFailureError)]
     for row in failed:
         typer.echo(f"view {row.view_id}: {row.answer}", err=True)
-    sink = pa.BufferOutputStream()
-    pq.write_table(pose_table(views, rows), sink)
-    write_atomically(output, sink.getvalue().to_pybytes())
+    _write(output, pose_table(views, rows))
+    if arcs is not None:
+        # Imported here for the same reason as above.
+        from workflows.pose_arcs import smooth
+
+        for name, table in zip(("poses", "arcs"), smooth(told.arcs, rows, views.calibration), strict=True):
+            arcs.mkdir(parents=True, exist_ok=True)
+            _write(arcs / f"{name}.parquet", table)
     typer.echo(f"{len(rows)} views, {len(rows) - len(failed)} with a pose, in {output}")
     given = compare_given(views, rows)
     if len(given):

@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from pipeline.errors import ConfigurationError
+from workflows.samples.aerial import AerialOptions, make_aerial_sample
 from workflows.samples.flyby import make_flyby_sample
 from workflows.samples.flyby_options import FlybyOptions
 from workflows.samples.options import StarSampleOptions
@@ -63,3 +64,18 @@ def flyby(
     except (ValueError, OSError) as error:
         raise ConfigurationError(f"{directory}: {error}") from error
     typer.echo(f"{frames + ring_frames} images, kernels and truth.json in {path.parent}")
+
+
+@app.command()
+def aerial(
+    directory: Annotated[Path, typer.Argument(help="New or empty folder.")],
+    frames: Annotated[int, typer.Option(min=10, max=20_000, help="Frames, one per second.")] = 120,
+    seed: Annotated[int, typer.Option(min=0, help="Same seed, same bytes.")] = 1,
+    outliers: Annotated[float, typer.Option(min=0.0, max=0.6, help="Largest share of wrong matches.")] = 0.5,
+) -> None:
+    """A flight over terrain on WGS 84 with ground points matched, for `pilotage pose`."""
+    try:
+        path = make_aerial_sample(directory, AerialOptions(frames, seed, outliers))
+    except (ValueError, OSError) as error:
+        raise ConfigurationError(f"{directory}: {error}") from error
+    typer.echo(f"{frames} frames, matches.parquet, cameras.json and truth.json in {path.parent}")

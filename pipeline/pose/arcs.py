@@ -16,13 +16,15 @@ from pydantic import Field
 from scipy.stats import chi2
 
 from pipeline.options import Options
-from pipeline.pose.arc_factors import BIAS_KEY, ArcImage, ArcNoise, first_factors, fix_noise, image_factors, step_factor
+from pipeline.pose.arc_factors import BIAS_KEY, ArcImage, ArcNoise, first_factors, image_factors, step_factor
 from pipeline.pose.graph import pose_key
 from pipeline.pose.records import MatchError, Pose, SourceLabel
 from pipeline.pose.se3 import SE3Utils
 from pipeline.records import BoolArray, FloatArray, Record
 
 _FIX_ROWS = 6
+# Fixes taken back settle at once or in two or three rounds.
+_MOST_ROUNDS = 5
 
 
 class ArcOptions(Options):
@@ -213,9 +215,28 @@ class _Segment:
             values = _optimize(graph, values)
         for k in range(self.start, self.stop):
             used[k] = _distance(self.images[k], values.atPose3(pose_key(k))) <= gate
-        graph = self.graph(used, None)
-        graph.push_back(left.graph)
-        return _optimize(graph, values)
+        return self._call_back(left, values, used, gate)
+
+    def _call_back(self, left: _Handed, values: gtsam.Values, used: BoolArray, gate: float) -> gtsam.Values:
+        """Solve with the fixes that are used, and take back those that neighbours of a wrong one were left out with."""
+        for _ in range(_MOST_ROUNDS):
+            graph = self.graph(used, None)
+            graph.push_back(left.graph)
+            values = _optimize(graph, values)
+            out = [k for k in range(self.start, self.stop) if self.images[k].fix is not None and not used[k]]
+            if not out:
+                break
+            marginals = gtsam.Marginals(graph, values)
+            # A pose that a fix does not hold has an error of its own.
+            away = [
+                _distance(self.images[k], values.atPose3(pose_key(k)), marginals.marginalCovariance(pose_key(k)))
+                for k in out
+            ]
+            back = [k for k, distance in zip(out, away, strict=True) if distance <= gate]
+            if not back:
+                break
+            used[back] = True
+        return values
 
     def hand_on(
         self, beyond: _Handed, values: gtsam.Values, used: BoolArray, keep: int, leftward: bool = False
@@ -263,12 +284,15 @@ def _optimize(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.
     return gtsam.LevenbergMarquardtOptimizer(graph, values, params).optimize()
 
 
-def _distance(image: ArcImage, pose: gtsam.Pose3) -> float:
-    """Sigmas between an image's fix and its pose; infinite without a fix."""
+def _distance(image: ArcImage, pose: gtsam.Pose3, covariance: FloatArray | None = None) -> float:
+    """Sigmas between an image's fix and its pose, with those of a pose that is free of it; infinite without one."""
     if image.fix is None:
         return float(np.inf)
     away = SE3Utils.to_gtsam(image.fix.pose).localCoordinates(pose)
-    return float(np.linalg.norm(fix_noise(image.fix).whiten(away)))
+    total = SE3Utils.gtsam_from_error(image.fix.covariance, image.fix.pose.camera_from_body)
+    if covariance is not None:
+        total = total + covariance
+    return float(np.sqrt(away @ np.linalg.solve(total, away)))
 
 
 def _result(images: Sequence[ArcImage], parts: list[_Part], used: BoolArray) -> ArcResult:

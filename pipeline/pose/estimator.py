@@ -211,6 +211,8 @@ class OpenCVGtsamPoseEstimator:
                 scale *= self._scatter(fit, int(inlier.sum()))
             full = with_point_errors(pose, every[0], scale**2 * every[2], every[3])
             following = self._ransac.gate(pose, every[0], every[1], full) & matches.plane.ok
+            if following.tobytes() == inlier.tobytes() and matches.stated and spread is None:
+                return _Solution(method, fit, inlier, scale)
             if following.tobytes() == inlier.tobytes() or inlier.tobytes() in seen:
                 break
             seen.add(inlier.tobytes())

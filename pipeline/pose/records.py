@@ -16,6 +16,7 @@ from pipeline.errors import PilotageError
 from pipeline.geometry.wgs84 import Datum, Geoid
 from pipeline.records import BoolArray, CameraModel, FloatArray, Record
 
+_UNIT = np.eye(3)
 _FRAME_NAMESPACE = uuid5(NAMESPACE_URL, "pilotage/frame")
 
 
@@ -147,7 +148,7 @@ class Pose(Record):
     def __post_init__(self) -> None:
         self._freeze(camera_from_body=(3, 3), position_km=(3,))
         matrix = self.camera_from_body
-        if not np.allclose(matrix @ matrix.T, np.eye(3), atol=1e-9) or np.linalg.det(matrix) < 0:
+        if not (np.abs(matrix @ matrix.T - _UNIT) <= 1e-9).all() or np.linalg.det(matrix) < 0:
             raise MatchError("camera_from_body is not a rotation")
         if not np.isfinite(self.position_km).all():
             raise MatchError("position_km is not finite")
