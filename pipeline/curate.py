@@ -16,6 +16,7 @@ from pipeline.predict.rings import RingFate
 from pipeline.records import FloatArray, State
 from pipeline.status import Rank, Status, StatusReason, status_of
 from pipeline.techniques.base import FeatureTable, TechniqueFailure, TechniqueResult, covariance_of
+from pipeline.techniques.landmark_state import LandmarkState
 from pipeline.techniques.landmark_table import LandmarkTable
 from pipeline.techniques.ring_edges import RingEdgeTable
 
@@ -108,7 +109,10 @@ def build_metadata_dict(
     document["bodies"] = [_body(fate) for fate in navigation.bodies]
     document["rings"] = [_ring(fate) for fate in navigation.rings]
     document["ring_edges"] = None if navigation.ring_edges is None else _ring_edges(navigation.ring_edges)
-    document["landmarks"] = None if navigation.landmarks is None else _landmarks(navigation.landmarks)
+    table = None if navigation.landmarks is None else navigation.landmarks.table
+    document["landmarks"] = None if table is None else _landmarks(table)
+    fix = None if navigation.landmarks is None else navigation.landmarks.state
+    document["landmark_state"] = None if fix is None else _landmark_state(fix)
     document["frame"] = None if navigation.frame is None else _frame_figures(navigation.frame)
     answers: list[Json] = [_technique(result, estimate) for result in navigation.results]
     document["techniques"] = [*answers, *(_failure(failure) for failure in navigation.failures)]
@@ -144,7 +148,7 @@ def error_document(
         "exposure_s": None, "status": status.value, "status_reason": reason.value, "detail": detail,
         "rank": Rank.FAILED.value, "confidence": None, "offset_px": None, "sigma_px": None, "covariance_px2": None,
         "observable": None, "pointing": None, "bodies": [], "rings": [], "ring_edges": None, "landmarks": None,
-        "frame": None,
+        "landmark_state": None, "frame": None,
         "techniques": [], "label": label,
         "provenance": _provenance(provenance),
     }  # fmt: skip
@@ -278,6 +282,17 @@ def _landmarks(table: LandmarkTable) -> dict[str, Json]:
     for axis, name in enumerate(("x_km", "y_km", "z_km")):
         columns[name] = _numbers(table.landmark_km[:, axis])
     return columns
+
+
+def _landmark_state(state: LandmarkState) -> dict[str, Json]:
+    """Body-fixed place of the camera; covariance order (x, y, z, rx, ry, rz), km and rad."""
+    return {
+        "position_km": _numbers(state.view.position_km),
+        "camera_from_body_wxyz": _numbers(quaternion_from_matrix(state.view.camera_from_body)),
+        "covariance": _numbers(state.covariance), "landmarks_used": int(state.used.sum()),
+        "landmarks_rejected": int((~state.used).sum()), "observable_directions": state.observable,
+        "converged": state.converged,
+    }  # fmt: skip
 
 
 def _technique(result: TechniqueResult, estimate: _CombinedEstimate | None) -> dict[str, Json]:

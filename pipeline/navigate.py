@@ -25,7 +25,6 @@ from pipeline.techniques.body_limb import (
     body_limb_nav,
     body_terminator_nav,
 )
-from pipeline.techniques.landmark_table import LandmarkTable
 from pipeline.techniques.ring_annulus import RingAnnulusOptions, ring_annulus_nav
 from pipeline.techniques.ring_edge import RingEdgeOptions, ring_edge_nav
 from pipeline.techniques.ring_edges import RingEdgeTable, ring_edge_table
@@ -34,7 +33,7 @@ from pipeline.techniques.ring_search import RingFix, find_rings
 from pipeline.techniques.star_field import StarFieldOptions, star_field_nav
 from pipeline.techniques.star_refine import StarRefineOptions, star_refine_nav
 from pipeline.techniques.star_unique import StarUniqueOptions, star_unique_nav
-from pipeline.techniques.surface_features import MapletSource, SurfaceFeatureOptions, surface_feature_nav
+from pipeline.techniques.surface_features import MapletSource, SurfaceFeatureOptions, SurfaceFix, surface_feature_nav
 
 
 class TechniquesOptions(Options):
@@ -87,7 +86,7 @@ class Navigation:
     ring_edges
         Measured radii, None without a fit of rings.
     landmarks
-        Landmarks looked for, None where none can be seen.
+        Landmarks looked for and the state from them, None where there are none.
     """
 
     state: State
@@ -100,7 +99,7 @@ class Navigation:
     bodies: tuple[BodyFate, ...] = ()
     rings: tuple[RingFate, ...] = ()
     ring_edges: RingEdgeTable | None = None
-    landmarks: LandmarkTable | None = None
+    landmarks: SurfaceFix | None = None
 
 
 StageListener = Callable[[str], None]
@@ -166,11 +165,11 @@ def navigate(
         ring_fix, answers = _ring_pass(rings, without_spikes(frame), fix, context, options.techniques)
         outcomes += answers
         on_stage("rings")
-    landmark_outcomes, landmarks = _landmark_pass(maplets, frame, state, options.techniques.SurfaceFeatureNav)
-    if landmark_outcomes:
-        outcomes += landmark_outcomes
+    landmarks = _landmark_pass(maplets, frame, state, options.techniques.SurfaceFeatureNav)
+    if landmarks is not None:
+        outcomes.append(landmarks.answer)
         on_stage("landmarks")
-    if len(predicted) or not (len(scene) or len(rings) or landmark_outcomes):
+    if len(predicted) or not (len(scene) or len(rings) or landmarks):
         outcomes += _first_pass(predicted, star_frame, context, options, on_stage)
     first = _fuse(outcomes, context, state, options)
     usable = first is not None and first.reason in (StatusReason.NAVIGATED, StatusReason.NAVIGATED_AT_EDGE)
@@ -188,30 +187,26 @@ def navigate(
 
 def _landmark_pass(
     maplets: tuple[MapletSource, ...], frame: Frame, state: State, options: SurfaceFeatureOptions
-) -> tuple[list[_Outcome], LandmarkTable | None]:
+) -> SurfaceFix | None:
     """Landmarks of the nearest body that has a catalogue of them."""
     by_name = {source.body.upper(): source for source in maplets}
     body = next((body for body in state.bodies if body.name.upper() in by_name), None)
     if body is None or not options.enabled:
-        return [], None
-    answer, table = surface_feature_nav(body, by_name[body.name.upper()], frame, state, options)
-    return [answer], table
+        return None
+    return surface_feature_nav(body, by_name[body.name.upper()], frame, state, options)
 
 
 def _ring_pass(
     rings: RingScene, frame: Frame, disc: DiscFix | str, context: NavContext, techniques: TechniquesOptions
 ) -> tuple[RingFix | str, list[_Outcome]]:
-    """Techniques on rings; from where bodies were found, if they were and the rings are there."""
+    """Techniques on rings."""
     edge, annulus = techniques.RingEdgeNav, techniques.RingAnnulusNav
     if not (edge.enabled or annulus.enabled):
         return "not looked for", []
     variance = smoothed_variance(frame)
-    fix: RingFix | str = "not found"
-    if isinstance(disc, DiscFix):
-        start = (disc.fit.offset_vu, disc.fit.rotation_rad)
-        fix = find_rings(rings, frame, variance, start, context, edge.search)
-    if isinstance(fix, str) or fix.confidence < edge.min_confidence:
-        fix = find_rings(rings, frame, variance, None, context, edge.search)
+    # From where bodies were found, and from everywhere: each may be wrong.
+    start = (disc.fit.offset_vu, disc.fit.rotation_rad) if isinstance(disc, DiscFix) else None
+    fix = find_rings(rings, frame, variance, start, context, edge.search)
     outcomes: list[_Outcome] = []
     if edge.enabled:
         outcomes.append(ring_edge_nav(rings, fix, context, edge))

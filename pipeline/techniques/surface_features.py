@@ -1,4 +1,8 @@
-"""SurfaceFeatureNav: maplets predicted, aligned together, found one by one, and fitted as one pointing."""
+"""SurfaceFeatureNav: maplets predicted, aligned together, found one by one, and fitted as one pointing.
+
+The same observations then update position and attitude together; that loop looks for the landmarks again under every
+new state until they stay where they are.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -8,7 +12,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 from scipy.stats import binom
 
-from pipeline.camera import project, project_jacobian
+from pipeline.camera import pixel_scale_rad, project, project_jacobian
 from pipeline.frame import Frame
 from pipeline.geometry.maplet import Maplet, MapletIndex, MapletView
 from pipeline.geometry.pointing import corrected_attitude, move_pivot
@@ -19,6 +23,7 @@ from pipeline.predict.maplets import CullingOptions, MapletReason, Visibility, c
 from pipeline.records import Body, BoolArray, FloatArray, Image, State
 from pipeline.status import StatusReason
 from pipeline.techniques.base import NavContext, TechniqueFailure, TechniqueOptions, TechniqueResult, edge_flags
+from pipeline.techniques.landmark_state import LandmarkState, LandmarkStateOptions, update_state
 from pipeline.techniques.landmark_table import LandmarkTable
 from pipeline.techniques.maplet_alignment import Alignment, align, light_of
 from pipeline.techniques.maplet_correlation import REACH, CorrelationOptions, LandmarkMatch, PeakStatus, locate
@@ -43,6 +48,15 @@ class SurfaceFeatureOptions(TechniqueOptions):
     most_landmarks: int = Field(120, ge=4, le=5000, description="maplets looked for in one picture, at most")
     least_landmarks: int = Field(4, ge=1, description="landmarks that must agree")
     rounds: int = Field(2, ge=1, le=5, description="times that all landmarks are looked for, geometry renewed between")
+    state: LandmarkStateOptions = LandmarkStateOptions()
+    position_sigma_share: float = Field(
+        0.0034, gt=0, le=1, description="1 sigma of the a-priori position per axis, share of the distance"
+    )
+    attitude_sigma_px: float = Field(
+        20.0, gt=0, description="1 sigma of the a-priori attitude per axis where the State brings none, pixels"
+    )
+    state_rounds: int = Field(3, ge=0, le=20, description="rounds of looking and updating the state; 0 leaves it out")
+    state_tolerance_px: float = Field(0.05, gt=0, description="largest move of a landmark that ends these rounds")
     removed_by_hand: tuple[str, ...] = Field((), description="landmarks never used (seed 001 section 3.4)")
 
 
@@ -69,6 +83,25 @@ class MapletSource:
 
 
 @dataclass(frozen=True, eq=False)
+class SurfaceFix:
+    """What the landmarks of one picture gave.
+
+    Attributes
+    ----------
+    answer
+        Pointing about the centroid of the landmarks, or why there is none.
+    table
+        One row per landmark looked for, None where none can be seen.
+    state
+        Position and attitude from the same landmarks, None without an answer.
+    """
+
+    answer: TechniqueResult | TechniqueFailure
+    table: LandmarkTable | None = None
+    state: LandmarkState | None = None
+
+
+@dataclass(frozen=True, eq=False)
 class _Search:
     """What stays the same from round to round."""
 
@@ -81,7 +114,7 @@ class _Search:
 
 def surface_feature_nav(
     body: Body, source: MapletSource, frame: Frame, state: State, options: SurfaceFeatureOptions
-) -> tuple[TechniqueResult | TechniqueFailure, LandmarkTable | None]:
+) -> SurfaceFix:
     """Find a body's landmarks in a picture.
 
     Parameters
@@ -99,23 +132,27 @@ def surface_feature_nav(
 
     Returns
     -------
-    tuple
-        Answer about the centroid of the landmarks; one row per landmark looked for, None where none can be seen.
+    SurfaceFix
+        Pointing, landmarks and state.
     """
     context, view = NavContext.of(state), view_of(state, body)
     seen = cull(view, source.index, source.surface, options.culling)
     rows = _chosen(seen, options.most_landmarks)
     if not len(rows):
-        return TechniqueFailure(NAME, StatusReason.NO_FEATURES_PREDICTED, f"{body.name}: {_tally(seen)}"), None
+        return SurfaceFix(TechniqueFailure(NAME, StatusReason.NO_FEATURES_PREDICTED, f"{body.name}: {_tally(seen)}"))
     search = _Search([source.load(int(row)) for row in rows], source.index, rows, (frame.raw, ~frame.bad), options)
     cells = light_of(view, search.maplets, options.images)
     alignment = align(cells, search.picture, context.search_margin_vu, context.max_rotation_rad)
     if alignment is None:
-        return TechniqueFailure(NAME, StatusReason.NO_FEATURES_DETECTED, f"{body.name}: no light varies"), None
+        return SurfaceFix(TechniqueFailure(NAME, StatusReason.NO_FEATURES_DETECTED, f"{body.name}: no light varies"))
     offset, _ = move_pivot(
         alignment.offset_vu, alignment.rotation_rad, alignment.pivot_vu, context.camera_model.centre_vu
     )
-    return _rounds(search, view, body, context, (offset, alignment))
+    answer, table, attitude = _rounds(search, view, body, context, (offset, alignment))
+    if isinstance(answer, TechniqueFailure):
+        return SurfaceFix(answer, table)
+    prior = _prior_covariance(view, search, state.attitude.sigma_rad)
+    return SurfaceFix(answer, table, _state(search, view, replace(view, camera_from_body=attitude), table, prior))
 
 
 def _chosen(seen: Visibility, most: int) -> NDArray[np.int64]:
@@ -134,7 +171,7 @@ def _tally(seen: Visibility) -> str:
 
 def _rounds(
     search: _Search, view: MapletView, body: Body, context: NavContext, start: tuple[FloatArray, Alignment]
-) -> tuple[TechniqueResult | TechniqueFailure, LandmarkTable]:
+) -> tuple[TechniqueResult | TechniqueFailure, LandmarkTable, FloatArray]:
     options, camera = search.options, context.camera_model
     offset, alignment = start
     attitude = corrected_attitude(camera, view.camera_from_body, offset, alignment.rotation_rad)
@@ -146,7 +183,7 @@ def _rounds(
         found = np.flatnonzero(table.found)
         if len(found) < max(options.least_landmarks, 1):
             detail = f"{body.name}: {len(found)} of {len(table)} landmarks found"
-            return TechniqueFailure(NAME, StatusReason.NO_FEATURES_DETECTED, detail), table
+            return TechniqueFailure(NAME, StatusReason.NO_FEATURES_DETECTED, detail), table, attitude
         fit = _fit(table, found, view, body, context, options)
         used = np.zeros(len(table), bool)
         used[found[fit.inlier]] = True
@@ -155,7 +192,42 @@ def _rounds(
         uncertainty = 0.0
     assert table is not None
     assert fit is not None
-    return _answer(fit, table, alignment, body, context, options), table
+    return _answer(fit, table, alignment, body, context, options), table, attitude
+
+
+def _prior_covariance(view: MapletView, search: _Search, sigma_rad: FloatArray | None) -> FloatArray:
+    """(6, 6) of the a-priori state, body-fixed: position by its distance, attitude by the State or in pixels."""
+    options = search.options
+    distance = np.linalg.norm(search.index.landmark_km[search.rows] - view.position_km, axis=1).mean()
+    if sigma_rad is None:
+        sigma_rad = np.full(3, options.attitude_sigma_px * float(pixel_scale_rad(view.camera).max()))
+        # The same pixels at the array's edge for the twist.
+        sigma_rad[2] = options.attitude_sigma_px / (0.5 * max(view.camera.shape_vu))
+    covariance = np.zeros((6, 6))
+    covariance[:3, :3] = np.eye(3) * (options.position_sigma_share * distance) ** 2
+    covariance[3:, 3:] = view.camera_from_body.T @ np.diag(np.asarray(sigma_rad) ** 2) @ view.camera_from_body
+    return covariance
+
+
+def _state(
+    search: _Search, before: MapletView, start: MapletView, table: LandmarkTable, prior: FloatArray
+) -> LandmarkState | None:
+    """Position and attitude, landmarks looked for again until the state leaves them in place."""
+    options, found_state, places = search.options, None, start.pixels(table.landmark_km)[0]
+    for _ in range(options.state_rounds):
+        found = np.flatnonzero(table.found)
+        matches = (
+            table.landmark_km[found], table.landmark_covariance_km2[found], table.observed_vu[found],
+            table.covariance_px2[found],
+        )  # fmt: skip
+        updated = update_state(before, matches, prior, options.state)
+        if isinstance(updated, str):
+            return None
+        found_state, moved = updated, updated.view.pixels(table.landmark_km)[0]
+        if np.abs(moved - places).max() < options.state_tolerance_px:
+            break
+        places, table = moved, _looked_for(search, before, updated.view, 0.0)
+    return found_state
 
 
 def _looked_for(search: _Search, before: MapletView, view: MapletView, uncertainty_px: float) -> LandmarkTable:

@@ -53,9 +53,11 @@ def navigated(displacement: FloatArray, twist_rad: float) -> tuple[FloatArray, T
     camera = state.camera_model
     before = corrected_attitude(camera, state.attitude.camera_from_j2000, displacement, twist_rad)
     moved = replace(state, attitude=replace(state.attitude, camera_from_j2000=before))
-    answer, table = surface_feature_nav(moved.bodies[0], source, frame, moved, SurfaceFeatureOptions())
+    fix = surface_feature_nav(moved.bodies[0], source, frame, moved, SurfaceFeatureOptions(state_rounds=0))
+    answer, table = fix.answer, fix.table
     assert isinstance(answer, TechniqueResult)
     assert table is not None
+    assert fix.state is None
     offset, _ = move_pivot(answer.offset_vu, answer.rotation_rad, answer.pivot_vu, camera.centre_vu)
     return corrected_attitude(camera, before, offset, answer.rotation_rad), answer, int(table.used.sum())
 

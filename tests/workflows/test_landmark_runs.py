@@ -43,6 +43,10 @@ def test_landmarks_are_found_fused_and_written(tmp_path: Path) -> None:
     assert landmarks["diagnostics"]["landmarks_used"] >= 10
     # Another technique on the same mesh sees the same displacement.
     assert np.abs(np.subtract(landmarks["offset_px"], answers["BodyDiscCorrelateNav"]["offset_px"])).max() < 2.0
+    state = document["landmark_state"]
+    assert state["observable_directions"] == 6
+    assert state["landmarks_used"] >= 10
+    assert (np.linalg.eigvalsh(state["covariance"]) > 0).all()
     assert any(name == "maplets of EROS" for name, _ in map(tuple, _pairs(document["provenance"]["catalogs"])))
     rows = duckdb.sql(
         f"select status, used, offset_dv_px, observed_v_px - predicted_v_px, sigma_dv_px, correlation "

@@ -1,6 +1,7 @@
 """State update from landmarks: partials against differences, pulls against planted errors, outliers with their name."""
 
 from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -62,8 +63,9 @@ def test_eq_2_27_updates_are_exact_rotations() -> None:
 
 
 def trial(
-    rng: np.random.Generator, count: int, mode: str, landmark_km: float, outliers: int = 0, prior: FloatArray = PRIOR
-) -> tuple[LandmarkState, FloatArray]:
+    rng: np.random.Generator, count: int, mode: Literal["solve", "consider"], landmark_km: float, outliers: int = 0,
+    prior: FloatArray = PRIOR,
+) -> tuple[LandmarkState, FloatArray]:  # fmt: skip
     """One update with planted errors of everything; the state and its error in the project's order."""
     true_place = landmarks(rng, count)
     believed = true_place + rng.normal(size=true_place.shape) * landmark_km
@@ -75,7 +77,7 @@ def trial(
     observed[:outliers] += rng.choice([-1, 1], (outliers, 2)) * rng.uniform(5, 30, (outliers, 2))
     noise = np.broadcast_to(np.diag([0.01, 0.04]), (count, 2, 2))
     place_noise = np.broadcast_to(np.eye(3) * landmark_km**2, (count, 3, 3))
-    options = LandmarkStateOptions(landmark_errors=mode)  # type: ignore[arg-type]
+    options = LandmarkStateOptions(landmark_errors=mode)
     found = update_state(start, (believed, place_noise, observed, noise), prior, options)
     assert isinstance(found, LandmarkState)
     change = TURN.T @ found.view.camera_from_body
@@ -84,7 +86,9 @@ def trial(
 
 
 @pytest.mark.parametrize(("mode", "landmark_km"), [("solve", 0.02), ("consider", 0.02), ("solve", 1e-6)])
-def test_eq_2_19_errors_are_as_large_as_the_covariance_says(mode: str, landmark_km: float) -> None:
+def test_eq_2_19_errors_are_as_large_as_the_covariance_says(
+    mode: Literal["solve", "consider"], landmark_km: float
+) -> None:
     rng = np.random.default_rng(5)
     nees = []
     for _ in range(250):
