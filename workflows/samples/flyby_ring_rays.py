@@ -43,7 +43,8 @@ class RingDisc(NamedTuple):
     undulation, undulation_step
         (m,) integral over the radius of undulations of unit rms, from zero on, in steps of so many km.
     waves
-        (k, 5) radius, arms, phase, km^2 per radian and relative amplitude of density waves that run outward.
+        (k, 5) radius, arms, phase, scale (km, after which a phase has gained half a radian) and relative amplitude of
+        density waves that run outward.
     spokes
         (k, 6) inner and outer radius, longitude, half width (rad), shear (rad/km) and relative brightness.
     propellers
@@ -158,14 +159,12 @@ def _texture(d, region, low, high, longitude):  # type: ignore[no-untyped-def]
     depth += d.grain[region] * _undulation(d, low, high)
     radius, width = 0.5 * (low + high), high - low
     for k in range(len(d.waves)):
-        out = radius - d.waves[k, 0]
-        if 0.0 < out < 5.0 * np.sqrt(d.waves[k, 3]):
+        out = (radius - d.waves[k, 0]) / d.waves[k, 3]
+        if 0.0 < out < 5.0:
             # A wave shorter than the stretch of radii averages out.
-            number = out / d.waves[k, 3]
-            rise = min(out / (0.5 * np.sqrt(d.waves[k, 3])), 1.0)
-            damped = d.waves[k, 4] * rise * np.exp(-((out / (2.5 * np.sqrt(d.waves[k, 3]))) ** 2))
-            phase = d.waves[k, 1] * longitude + d.waves[k, 2] + 0.5 * out * number
-            depth += damped * np.cos(phase) * np.exp(-((number * width) ** 2) / 24.0)
+            blur = out * width / d.waves[k, 3]
+            damped = d.waves[k, 4] * min(2.0 * out, 1.0) * np.exp(-out * out / 6.25 - blur * blur / 24.0)
+            depth += damped * np.cos(d.waves[k, 1] * longitude + d.waves[k, 2] + 0.5 * out * out)
     for k in range(len(d.propellers)):
         out, size = radius - d.propellers[k, 0], d.propellers[k, 2]
         if abs(out) < 4.0 * (size + width):

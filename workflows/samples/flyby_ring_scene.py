@@ -33,10 +33,10 @@ UNDULATION_REACH_KM = 90_000.0
 UNDULATION_KM = (12.0, 2500.0)
 """Shortest and longest wavelength of the undulations."""
 WAVES = (
-    (59_320.0, 6, 900.0), (60_750.0, 8, 500.0), (61_640.0, 5, 700.0), (63_580.0, 9, 400.0), (64_440.0, 7, 600.0),
-    (65_210.0, 11, 300.0), (46_050.0, 2, 2500.0),
+    (59_320.0, 6, 30.0), (60_750.0, 8, 22.0), (61_640.0, 5, 26.0), (63_580.0, 9, 20.0), (64_440.0, 7, 24.0),
+    (65_210.0, 11, 17.0), (46_050.0, 2, 50.0),
 )  # fmt: skip
-"""Radius (km), arms and km^2 per radian of density waves."""
+"""Radius (km), arms and scale (km) of density waves, whose phase grows as half the square of the distance in it."""
 SPOKES_KM = (43_000.0, 53_000.0)
 
 
