@@ -244,7 +244,7 @@ def _pose(view: dict[str, FloatArray]) -> Pose:
 
 def _arc(arc: dict[str, FloatArray]) -> Arc:
     views: list[dict[str, FloatArray]] = arc["views"]  # type: ignore[assignment]
-    options: dict[str, float] = dict(arc.get("options", {}))  # type: ignore[call-overload]
+    options: dict[str, float] = dict(arc.get("options", {}))
     return Arc(
         str(arc["arc_id"]), options,
         tuple(ArcView(int(v["view_id"]), float(v["et"]), _pose(v), bool(v.get("throttled", False))) for v in views),

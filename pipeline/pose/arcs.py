@@ -25,6 +25,8 @@ from pipeline.records import BoolArray, FloatArray, Record
 _FIX_ROWS = 6
 # Fixes taken back settle at once or in two or three rounds.
 _MOST_ROUNDS = 5
+# Kilometres and radians: a stale linearisation by an angle a misplaces a range by half its square.
+_RELINEARIZE = 1e-5
 
 
 class ArcOptions(Options):
@@ -340,7 +342,8 @@ class GrowingArc:
     def __init__(self, options: ArcOptions | None = None) -> None:
         self.options = options or ArcOptions()
         parameters = gtsam.ISAM2Params()
-        parameters.setRelinearizeThreshold(0.01)
+        parameters.setRelinearizeThreshold(_RELINEARIZE)
+        parameters.relinearizeSkip = 1
         self.isam = gtsam.ISAM2(parameters)
         self._images: list[ArcImage] = []
 
@@ -374,6 +377,29 @@ class GrowingArc:
         self.isam.update(graph, values)
         self.isam.update()
         self._images.append(image)
+
+    def key_of(self, image_id: str) -> int:
+        """Key of an image's pose in the graph.
+
+        Parameters
+        ----------
+        image_id
+            An image of the arc.
+
+        Returns
+        -------
+        int
+            GTSAM key.
+
+        Raises
+        ------
+        MatchError
+            If the arc has no such image.
+        """
+        for index in range(len(self._images) - 1, -1, -1):
+            if self._images[index].image_id == image_id:
+                return pose_key(index)
+        raise MatchError(f"{image_id} is no image of this arc")
 
     def pose(self, index: int) -> Pose:
         """Present pose of one image."""

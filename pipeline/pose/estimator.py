@@ -13,7 +13,7 @@ from pipeline.camera import project
 from pipeline.geometry.rotations import quaternion_from_matrix
 from pipeline.geometry.wgs84 import WgsConverter
 from pipeline.options import Options
-from pipeline.pose.graph import posterior
+from pipeline.pose.graph import SharedGraph, posterior, shared_posterior
 from pipeline.pose.normalise import PlanePoints, to_plane
 from pipeline.pose.pnp import refuse_degenerate, starting_poses
 from pipeline.pose.ransac import RansacFilter, RansacOptions, log10_false_alarms
@@ -99,10 +99,14 @@ class OpenCVGtsamPoseEstimator:
     ----------
     options
         Bounds.
+    shared
+        Growing graph of the arc; matches go into it, and poses come out of it, except on throttled frames. Without one
+        every image is a graph of its own.
     """
 
-    def __init__(self, options: PoseOptions | None = None) -> None:
+    def __init__(self, options: PoseOptions | None = None, shared: SharedGraph | None = None) -> None:
         self.options = options or PoseOptions()
+        self._shared = shared
         self._ransac = RansacFilter(self.options.ransac)
         self._mode = CovarianceMode.MARGINALS
         _log(logging.INFO, "C4 ready", estimator="opencv_gtsam", default_covariance=self._mode.name)
@@ -282,7 +286,10 @@ class OpenCVGtsamPoseEstimator:
 
     def _report(self, matches: _Matches, best: _Solution, calibration: CameraCalibration) -> PoseEstimate:
         points, xy, covariance, spread = matches.take(best.inlier)
-        if self._mode is CovarianceMode.MARGINALS:
+        if self._mode is CovarianceMode.MARGINALS and self._shared is not None:
+            full = with_point_errors(best.fit.pose, points, best.scale**2 * covariance, spread)
+            pose, errors = shared_posterior(self._shared, matches.result.image_id, points, xy, full)
+        elif self._mode is CovarianceMode.MARGINALS:
             pose, errors = posterior(best.fit.pose, points, xy, best.scale**2 * covariance, spread)
         else:
             pose, errors = best.fit.pose, covariance_of(best.fit.information)

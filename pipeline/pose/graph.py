@@ -1,6 +1,6 @@
 """Factors of GTSAM: one image's matches on its pose, with the points' own uncertainty."""
 
-from collections.abc import Callable
+from typing import Protocol
 
 import gtsam
 import numpy as np
@@ -12,10 +12,19 @@ from pipeline.records import FloatArray
 
 # The ideal plane is seen by a camera of unit focal length.
 _IDEAL = gtsam.Cal3_S2(1.0, 1.0, 0.0, 0.0, 0.0)
+# iSAM2 makes one step of Gauss and Newton per update; from a trajectory's prior three are enough.
+_SETTLING_UPDATES = 3
 # A point at or behind the camera has no projection; so large a residual turns every step back.
 _BEHIND = 1e6
 
-PoseSymbol = Callable[[int], int]
+
+class SharedGraph(Protocol):
+    """An arc's growing graph, which owns its iSAM2."""
+
+    isam: gtsam.ISAM2
+
+    def key_of(self, image_id: str) -> int:
+        """Key of an image's pose."""
 
 
 def pose_key(index: int) -> int:
@@ -108,6 +117,39 @@ def match_graph(
         graph.add(gtsam.PriorFactorPoint3(point_key(i), point, prior))
         values.insert(point_key(i), point)
     return graph, values
+
+
+def shared_posterior(
+    shared: SharedGraph, image_id: str, points_km: FloatArray, xy: FloatArray, covariance: FloatArray
+) -> tuple[Pose, FloatArray]:
+    """Add an image's matches to an arc's graph, and read its pose there: what else the graph knows is in it.
+
+    Parameters
+    ----------
+    shared
+        The arc, which has the image's pose already.
+    image_id
+        The image.
+    points_km
+        (n, 3) body-fixed.
+    xy
+        (n, 2) on the ideal plane.
+    covariance
+        (n, 2, 2) there, the points' own projected into it.
+
+    Returns
+    -------
+    tuple
+        Pose; (6, 6) covariance of errors (x, y, z, rx, ry, rz), km and rad.
+    """
+    key = shared.key_of(image_id)
+    graph = gtsam.NonlinearFactorGraph()
+    graph.add(resection_factor(key, points_km, xy, covariance))
+    shared.isam.update(graph, gtsam.Values())
+    for _ in range(_SETTLING_UPDATES):
+        shared.isam.update()
+    pose = SE3Utils.from_gtsam(shared.isam.calculateEstimatePose3(key))
+    return pose, SE3Utils.error_from_gtsam(shared.isam.marginalCovariance(key), pose.camera_from_body)
 
 
 def posterior(

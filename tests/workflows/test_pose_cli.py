@@ -154,8 +154,8 @@ def test_a_bundle_is_better_than_views_alone(tmp_path: Path) -> None:
         assert np.mean(nees) < 14
         away[name] = np.mean(lost)
     assert away["bundle"] < away["alone"]
-    code, _, error = _run(tmp_path / "m.parquet", _cameras(tmp_path, poses, []), tmp_path / "x", "--bundle")
-    assert "fewer than two" in str(error)
+    _, _, refused = _run(tmp_path / "m.parquet", _cameras(tmp_path, poses, []), tmp_path / "x", "--bundle")
+    assert "fewer than two" in str(refused)
 
 
 def _broken(kind: str, table: pd.DataFrame) -> pd.DataFrame:

@@ -124,7 +124,7 @@ def test_bad_arcs_are_one_error(flight: Path, tmp_path: Path) -> None:
         (lambda arc: arc.pop("arc_id"), "no 'arc_id'"),
     ):  # fmt: skip
         broken = json.loads(json.dumps(content))
-        change(broken["arcs"][0])
+        change(broken["arcs"][0])  # type: ignore[no-untyped-call]
         (tmp_path / "cameras.json").write_text(json.dumps(broken))
         arguments = [str(flight / "matches.parquet"), "--cameras", str(tmp_path / "cameras.json")]
         result = CliRunner().invoke(app, ["pose", *arguments, "-o", str(tmp_path / "p"), "--arcs", str(tmp_path / "a")])

@@ -7,12 +7,15 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
+from pipeline.camera import project
 from pipeline.pose.arc_factors import BIAS_KEY, ArcImage, AttitudeFix, attitude_factor, step_factor
 from pipeline.pose.arcs import ArcOptions, ArcResult, GrowingArc, labels_of, smooth_arc
+from pipeline.pose.estimator import OpenCVGtsamPoseEstimator
 from pipeline.pose.graph import pose_key, resection_factor
-from pipeline.pose.records import MatchError, Pose, SourceLabel
+from pipeline.pose.records import CameraCalibration, MatchError, MatchResult, Pose, SourceLabel, ThermalState
 from pipeline.pose.se3 import SE3Utils
 from tests.pipeline.pose.arc_scenes import plant_arc
+from tests.pipeline.pose.scenes import CAMERAS, DATUM
 
 OPTIONS = ArcOptions(segment=40)
 
@@ -107,6 +110,31 @@ def test_a_growing_arc_arrives_where_the_whole_one_does() -> None:
     with pytest.raises(MatchError, match="not later"):
         growing.add(replace(images[3], image_id="late"))
     assert poses
+
+
+def test_an_estimator_adds_its_matches_to_the_arcs_graph() -> None:
+    images, poses, _ = plant_arc(6, 25, OPTIONS, gap=1.0)
+    growing = GrowingArc(OPTIONS)
+    for image in images[:5]:
+        growing.add(image)
+    before = growing.covariance(4)
+    rng = np.random.default_rng(2)
+    points = rng.uniform(-60, 60, (80, 3))
+    exact, _ = project(CAMERAS[2], poses[4].to_camera(points))
+    noise = np.tile(np.eye(2) * 0.09, (80, 1, 1))
+    matches = MatchResult("i4", np.arange(80), exact + rng.normal(size=exact.shape) * 0.3, points, noise)
+    calibration = CameraCalibration.of(CAMERAS[2], DATUM)
+    alone = OpenCVGtsamPoseEstimator().estimate(matches, calibration, ThermalState())
+    shared = OpenCVGtsamPoseEstimator(shared=growing).estimate(matches, calibration, ThermalState())
+    assert_allclose(growing.pose(4).position_km, shared.pose.position_km)
+    for answer in (alone, shared):
+        error = SE3Utils.error(answer.pose, poses[4])
+        assert error @ np.linalg.solve(answer.covariance_6x6, error) < 25
+    # The arc knows more than the image alone, and its neighbours profit.
+    assert np.linalg.det(shared.covariance_6x6) < np.linalg.det(alone.covariance_6x6)
+    assert np.trace(growing.covariance(3)[:3, :3]) < 0.01 * np.trace(before[:3, :3])
+    with pytest.raises(MatchError, match="no image"):
+        growing.key_of("none")
 
 
 def test_an_arc_without_fixes_is_dead_reckoned_within_its_priors() -> None:
