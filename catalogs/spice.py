@@ -17,6 +17,7 @@ from catalogs.ring_catalog import RingCatalog, rings_of
 from pipeline.camera import field_of_view
 from pipeline.errors import ContractError, GeometryError
 from pipeline.geometry.astrometry import SPEED_OF_LIGHT_KM_S
+from pipeline.geometry.rotations import rotation_about
 from pipeline.predict.body_view import may_shade
 from pipeline.predict.stars import reach_px
 from pipeline.records import Attitude, Body, FloatArray, RingSystem, Spacecraft, State
@@ -386,8 +387,9 @@ def _ring_system(
     """Rings as seen: plane of the planet's equator, longitudes from its ascending node on the J2000 equator.
 
     Light time and aberration differ between the planet and rings far from it. In the planet's frame of rest a point at
-    X is seen along ``X - v |X| / c`` with v the planet's velocity past the spacecraft; one place of the centre serves
-    the whole field when that is taken for the ring point in its middle.
+    X is seen along ``X - v |X| / c`` with v the planet's velocity past the spacecraft. Near a ring point at X0, in the
+    direction s, that is a shift by that of X0 and a turn by ``(v x s) / c`` about it, which moves what lies deeper
+    aside; what the turn changes along the line of sight is not seen.
     """
     try:
         moving, _ = spiceypy.spkezr(str(candidate.naif_id), state.et, _J2000, "NONE", str(names.spacecraft_id))
@@ -407,10 +409,15 @@ def _ring_system(
         reach = float((pole @ position) / (pole @ boresight))
     distance = float(np.linalg.norm(position))
     if not 0.0 < reach < 2.0 * distance:
-        reach = distance
+        reach = max(float(boresight @ position), 0.0)
     sun = _direction_to_sun(candidate.naif_id, left)
+    middle = reach * boresight
+    axis = np.cross(velocity, boresight) / SPEED_OF_LIGHT_KM_S
+    angle = float(np.linalg.norm(axis))
+    turn = rotation_about(axis, angle) if angle > 0 else np.eye(3)
+    seen = middle - velocity * (reach / SPEED_OF_LIGHT_KM_S) + turn @ (position - middle)
     return RingSystem(
-        candidate.name, position - velocity * (reach / SPEED_OF_LIGHT_KM_S), plane,
+        candidate.name, seen, plane @ turn.T,
         float(np.arcsin(np.clip(pole @ sun, -1.0, 1.0))), sun, catalog.at(left),
     )  # fmt: skip
 

@@ -29,6 +29,7 @@ _FLATTEN = 25
 _CLIP_QUANTILE = 0.997
 _LATTICE = 16_000
 _SCAN_PX = 12
+_PLACES_ELSEWHERE = 16
 # Places nearer than this to the best one, in pixels across the edges, are the best one.
 _SAME_PX = 0.8
 _FEWEST_ROTATIONS = 11
@@ -53,7 +54,7 @@ class RingFix:
     fit
         Of the edges, free brightness.
     correlation
-        At the peak; NaN where the start was given.
+        At the peak that was followed.
     confidence
         Probability that it is no rival and no accident.
     rival_gap
@@ -106,10 +107,11 @@ def find_rings(
     RingFix or str
         Or in one line why there is none.
     """
+    peaks = _peaks(scene, frame, context, options)
     if start is not None:
-        peaks = [_Peak((float(start[0][0]), float(start[0][1])), start[1], float("nan"))]
-    else:
-        peaks = _peaks(scene, frame, context, options)
+        # Bodies may have told the place, or may be wrong: it is one more to be compared.
+        height = peaks[0].correlation if peaks else 1.0
+        peaks = [_Peak((float(start[0][0]), float(start[0][1])), float(start[1]), height), *peaks]
     if not peaks:
         return "the predicted rings have no contrast inside the frame"
     if peaks[0].correlation < options.min_correlation:
@@ -252,7 +254,7 @@ def _judged(
         (0.5 * count * np.log(left[int(k)].mean / best.mean), np.nan)
         for k in order[1:] if not _one_place(fit, fits[int(k)][0])
     ]  # fmt: skip
-    gaps += _scan(scene, lattice, fit, best, count, context)
+    gaps += _scan(scene, lattice, fit, best, count, context) + _elsewhere(scene, lattice, fit, best, count, context)
     tries = float(np.prod([2.0 * m + 1.0 for m in context.search_margin_vu]))
     gain = 0.5 * count * np.log(best.bare / best.mean)
     doubt = tries * float(np.exp(np.clip(len(scene) + 3.0 - gain, -700.0, 50.0)))
@@ -324,3 +326,19 @@ def _scan(
     middle: NDArray[np.int64] = np.arange(1, len(shifts) - 1)
     dips = middle[(left[1:-1] < left[:-2]) & (left[1:-1] <= left[2:]) & (np.abs(shifts[1:-1]) > 1.0)]
     return [(0.5 * count * float(np.log(max(left[k] / best.mean, 1e-12))), float(shifts[k])) for k in dips]
+
+
+def _elsewhere(
+    scene: RingScene, lattice: _Lattice, fit: RingFit, best: _LeftOver, count: float, context: NavContext
+) -> list[tuple[float, float]]:
+    """Gaps and shifts of places all over the margin, across the edges: what any place explains of a textured image."""
+    values, vectors = np.linalg.eigh(fit.information[:2, :2])
+    across = vectors[:, int(np.argmax(values))]
+    reach = float(np.min(np.asarray(context.search_margin_vu) / np.maximum(np.abs(across), 1e-9)))
+    middle = float(across @ fit.offset_vu)
+    shifts = np.linspace(-reach, reach, _PLACES_ELSEWHERE) - middle
+    result = []
+    for shift in shifts[np.abs(shifts) > _SCAN_PX]:
+        left = _left_over(scene, lattice, fit.offset_vu + shift * across, fit.rotation_rad)
+        result.append((0.5 * count * float(np.log(max(left.mean / best.mean, 1e-12))), float(shift)))
+    return result

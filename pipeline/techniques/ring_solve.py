@@ -23,6 +23,8 @@ _OUTLIER_SIGMAS, _LEAST_OTHERS, _LEAST_TROUBLE_PX = 4.0, 2, 0.25
 _LOOSE_PX, _TIGHT_PX, _USUAL_EDGE_PX = 0.3, 0.02, 0.003
 # A perfect catalogue is one whose errors no pixel shows; a free radius has this share of its prior's weight.
 _PERFECT_PX, _FREE = 1e-4, 1e-12
+# Standard deviation over median absolute value of a normal variable.
+_MEDIAN_TO_SIGMA = 1.4826
 _TINY = 1e-12
 
 
@@ -345,6 +347,9 @@ def without_outlier(system: System, layout: Layout, radii: Radii, px_per_km: Flo
     sigma = np.sqrt(variance / left + radii.sigma[at - layout.size - 1] ** 2)
     told = (np.diag(system.gram)[at] > 0) & ~radii.free[:count] & (left > 1e-6)
     ratio = np.where(told, np.abs(gap) / sigma, 0.0)
+    if told.any():
+        # Where most features scatter more than the catalogue says, all are less certain and none is to blame.
+        ratio /= max(1.0, _MEDIAN_TO_SIGMA * float(np.median(ratio[told])))
     worst = int(np.argmax(ratio))
     others = int(told.sum()) - 1
     off = abs(gap[worst]) * px_per_km[worst] > _LEAST_TROUBLE_PX
