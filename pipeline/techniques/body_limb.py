@@ -170,7 +170,9 @@ def body_terminator_nav(
         return TechniqueFailure(TERMINATOR, StatusReason.NO_FEATURES_PREDICTED, "no body is large enough")
     radius = scene.primary(scene.views).diameter_px / 2
     width = float(np.clip(options.band_share * radius, options.band.half_width_px, 60.0))
-    band = options.band.model_copy(update={"half_width_px": width})
+    # A line that has left its band was not measured.
+    update = {"half_width_px": width, "largest_shift_px": min(options.band.largest_shift_px, width)}
+    band = options.band.model_copy(update=update)
     start = _Start(fix.offset_vu, fix.rotation_rad, min(confidence, _FOLLOWER), fix.correlation)
     fields = {
         k: Field_(options.relief_share * view.diameter_px / 2, options.reach_deg, False, 0.0)
@@ -179,6 +181,12 @@ def body_terminator_nav(
     fit = _fit_line(scene, frame, fix, start, context, fields, band, options.relief, options.errors, at_limb=False)
     if isinstance(fit, str):
         return TechniqueFailure(TERMINATOR, StatusReason.NO_FEATURES_DETECTED, fit)
+    place = scene.primary(scene.views).centre_vu[None]
+    moved = _moved(place, fit.offset_vu, fit.rotation_rad, context)
+    drift = float(np.hypot(*(moved - _moved(place, fix.offset_vu, fix.rotation_rad, context))[0]))
+    if drift > width:
+        reason = StatusReason.NO_FEATURES_DETECTED
+        return TechniqueFailure(TERMINATOR, reason, f"the line was {drift:.0f} px from where the body was found")
     return _result(TERMINATOR, "terminator", fit, start, scene, context, options, options.min_shown_share)
 
 

@@ -26,6 +26,8 @@ _LONG_REACH_DEG = 40.0
 _ODD_FACTOR = 1.3
 # Long-wave error of a shape over its relief.
 _UNKNOWN_LONG = 1.0
+# The same over the relief that an outline shows itself: part of its long waves is in that already.
+_SHOWN_LONG = 0.5
 _SHORT_ARC_DEG = 100.0
 # A weight this small is an outlier's; it keeps the covariance finite.
 _LEAST_WEIGHT = 1e-4
@@ -221,7 +223,7 @@ def _likeliest(
     least = 0.0 if known and span_deg > _SHORT_ARC_DEG else _UNKNOWN_LONG
 
     def long_wave(f: float, g: float) -> float:
-        return max(g, least if known else least * f)
+        return max(g, least if known else _SHOWN_LONG * f)
 
     def score(f: float, g: float) -> float:
         return _restricted_likelihood(shift, design, base + f**2 * near + long_wave(f, g) ** 2 * far)
