@@ -5,7 +5,7 @@ mistaken for its neighbour fits as well locally; what tells them apart is all pi
 compared by how much of a sample of the image rings of free brightness leave over.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -244,7 +244,7 @@ def _judged(
 ) -> RingFix:
     """The fit that leaves least, and how much more its rivals leave."""
     lattice = _lattice(frame, variance)
-    left = [_left_over(scene, lattice, fit.offset_vu, fit.rotation_rad) for fit, _ in fits]
+    left = [_left_over(_corrected(scene, fit), lattice, fit.offset_vu, fit.rotation_rad) for fit, _ in fits]
     order = np.argsort([value.mean for value in left])
     fit, peak = fits[int(order[0])]
     best = left[int(order[0])]
@@ -254,7 +254,8 @@ def _judged(
         (0.5 * count * np.log(left[int(k)].mean / best.mean), np.nan)
         for k in order[1:] if not _one_place(fit, fits[int(k)][0])
     ]  # fmt: skip
-    gaps += _scan(scene, lattice, fit, best, count, context) + _elsewhere(scene, lattice, fit, best, count, context)
+    true = _corrected(scene, fit)
+    gaps += _scan(true, lattice, fit, best, count) + _elsewhere(true, lattice, fit, best, count, context)
     tries = float(np.prod([2.0 * m + 1.0 for m in context.search_margin_vu]))
     gain = 0.5 * count * np.log(best.bare / best.mean)
     doubt = tries * float(np.exp(np.clip(len(scene) + 3.0 - gain, -700.0, 50.0)))
@@ -315,8 +316,14 @@ def _explained(gram: FloatArray, pull: FloatArray) -> float:
     return float(pull @ np.linalg.solve(gram + ridge, pull))
 
 
+def _corrected(scene: RingScene, fit: RingFit) -> RingScene:
+    """Edges with the radii that a fit has found: an error of the catalogue must not look like a wrong place."""
+    shift = fit.radius_km[scene.feature] + fit.edge_km
+    return replace(scene, curves=scene.curves + shift[:, None])
+
+
 def _scan(
-    scene: RingScene, lattice: _Lattice, fit: RingFit, best: _LeftOver, count: float, context: NavContext
+    scene: RingScene, lattice: _Lattice, fit: RingFit, best: _LeftOver, count: float
 ) -> list[tuple[float, float]]:
     """Log-likelihood gaps and shifts of the dips on a walk across the edges."""
     values, vectors = np.linalg.eigh(fit.information[:2, :2])
