@@ -324,7 +324,7 @@ def unit_equations(  # type: ignore[no-untyped-def]
                 gram[a, a] *= 1.0 + 1e-10
             if gram[0, 0] <= 0:
                 break
-            chosen = np.linalg.solve(gram, pull)
+            chosen[:] = np.linalg.solve(gram, pull)
             chi2, used = 0.0, 0.0
             for p in range(low, high):
                 expected = 0.0

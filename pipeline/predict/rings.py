@@ -394,7 +394,7 @@ def _course(scene: RingScene, pose: RingPose, edge: int, canvas: Window) -> tupl
         return 0.0, 0.0, False, 0.0
     pixels, _ = scene.place(pose, edge, longitude)
     rows, cols = scene.state.camera_model.shape_vu
-    inside = ((pixels >= -0.5) & (pixels <= np.array([rows, cols]) - 0.5)).all(axis=1)
+    inside = np.asarray(((pixels >= -0.5) & (pixels <= np.array([rows, cols]) - 0.5)).all(axis=1))
     steps = np.hypot(*np.diff(pixels, axis=0).T)
     near = float(steps[steps < 64.0].sum()) + 1.0
     hidden = scene.hidden(pose, edge, longitude)
@@ -442,15 +442,15 @@ def visible_longitudes(scene: RingScene, pose: RingPose, edge: int, window: Wind
     high = low + np.array([window.rows, window.cols])
     middle, half = (low + high) / 2, float(np.hypot(*(high - low))) / 2
     step = TURN / _COARSE
-    longitude = step * np.arange(_COARSE)
+    longitude: FloatArray = step * np.arange(_COARSE, dtype=float)
     while True:
         pixels, ahead = scene.place(pose, edge, longitude)
         inside = ahead & ((pixels >= low) & (pixels <= high)).all(axis=1)
         # A stretch may pass through a corner between two samples: look at those next to the window too.
-        speed = 2.0 * np.hypot(*(scene.place(pose, edge, longitude + 0.5 * step)[0] - pixels).T)
+        speed = 2.0 * np.hypot(*(scene.place(pose, edge, np.asarray(longitude + 0.5 * step))[0] - pixels).T)
         close = ahead & ~(np.hypot(*(pixels - middle).T) > half + speed)
         if inside.sum() >= _ENOUGH or not close.any() or float(np.nanmax(speed[close])) < _FINE_PX:
             break
-        longitude = np.sort((longitude[close][:, None] + step * (np.arange(4) - 1.5) / 4.0).ravel())
+        longitude = np.asarray(np.sort((longitude[close][:, None] + step * (np.arange(4) - 1.5) / 4.0).ravel()))
         step /= 4.0
     return np.asarray(longitude[inside])

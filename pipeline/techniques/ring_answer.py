@@ -59,7 +59,7 @@ def observed(fit: RingFit, context: NavContext) -> Observed:
         # Along the edges and about their middle the search's own bounds are all that is known.
         bound = context.max_rotation_rad / np.sqrt(3.0)
         prior = np.diag([3.0 / margin**2, 3.0 / margin**2, 1.0 / bound**2 if bound else 0.0][:size])
-        covariance = np.linalg.inv(fit.information + prior)
+        covariance = np.asarray(np.linalg.inv(fit.information + prior))
         return _one_direction(covariance[:2, :2], fit.pivot_vu, size)
     if size == 3 and rotation_shows(fit.information, context):
         return Observed(fit.information, fit.pivot_vu, 3)
@@ -67,7 +67,8 @@ def observed(fit: RingFit, context: NavContext) -> Observed:
     values = np.linalg.eigvalsh(settled.information[:2, :2])
     if values[0] < 1.0 / (_SEEN_SHARE * margin) ** 2:
         prior = np.eye(2) * 3.0 / margin**2
-        return _one_direction(np.linalg.inv(settled.information[:2, :2] + prior), settled.pivot_vu, size)
+        covariance = np.asarray(np.linalg.inv(settled.information[:2, :2] + prior))
+        return _one_direction(covariance, settled.pivot_vu, size)
     return Observed(settled.information, settled.pivot_vu, 2)
 
 

@@ -169,7 +169,7 @@ def smoothed_variance(frame: Frame) -> Image:
     numpy.ndarray
         (rows, cols) DN^2.
     """
-    return np.asarray(frame.noise.variance(cv2.blur(frame.raw, (3, 3))), np.float32)
+    return np.asarray(frame.noise.variance(np.asarray(cv2.blur(frame.raw, (3, 3)), np.float32)), np.float32)
 
 
 def fit_rings(

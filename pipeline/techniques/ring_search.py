@@ -217,7 +217,7 @@ def _peaks(scene: RingScene, frame: Frame, context: NavContext, options: RingSea
 
 def _rotations(shape: tuple[int, ...], factor: int, bound: float, options: RingSearchOptions) -> int:
     """The seed's eleven, more where they would move the corners by more than a few coarse pixels."""
-    wanted = int(np.ceil(bound * float(np.hypot(*shape)) / (4.0 * factor))) + 1
+    wanted = int(np.ceil(bound * float(np.linalg.norm(shape)) / (4.0 * factor))) + 1
     return int(np.clip(wanted, _FEWEST_ROTATIONS, options.most_rotations)) | 1
 
 

@@ -89,7 +89,7 @@ def make_units(scene: RingScene, pose: RingPose, join_px: float) -> RingUnits | 
     lines = [_line(scene, pose, edge, centres) for edge in range(len(scene))]
     places, normals, scales = (np.stack([line[k] for line in lines], axis=1) for k in range(3))
     limit = np.array([rows, cols]) + join_px
-    inside = ((places > -1.0 - join_px) & (places < limit)).all(axis=2)
+    inside = np.asarray(((places > -1.0 - join_px) & (places < limit)).all(axis=2))
     return _grouped(inside, places, normals, scales, centres, cell_of, span, join_px)
 
 
@@ -163,19 +163,19 @@ def _grouped(
     cell_list: list[int] = []
     for cell in range(cells):
         first = -1
-        for k in np.nonzero(inside[cell])[0]:
+        for k in np.nonzero(inside[cell])[0].tolist():
             if first < 0 or apart[cell, k - 1] or k - first >= MOST_EDGES or unit_of[cell, k - 1] < 0:
-                first = int(k)
+                first = k
                 edges.append((first, first))
                 cell_list.append(cell)
-            edges[-1] = (first, int(k) + 1)
+            edges[-1] = (first, k + 1)
             unit_of[cell, k] = len(edges) - 1
-    bounds, cell = np.array(edges, np.int64).reshape(-1, 2), np.array(cell_list, np.int64)
+    bounds, owner = np.array(edges, np.int64).reshape(-1, 2), np.array(cell_list, np.int64)
     offset = np.arange(MOST_EDGES)
     present = offset < (bounds[:, 1] - bounds[:, 0])[:, None]
     column = np.minimum(bounds[:, :1] + offset, count - 1)
-    pick = (cell[:, None], column)
+    pick = (owner[:, None], column)
     return RingUnits(
         bounds, present, np.nan_to_num(places[pick]), np.nan_to_num(normals[pick]), np.nan_to_num(scales[pick]),
-        centres[cell], cell_of, span, unit_of,
+        centres[owner], cell_of, span, unit_of,
     )  # fmt: skip

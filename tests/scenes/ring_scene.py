@@ -41,7 +41,7 @@ class Band:
     def inside(self, radius: FloatArray, longitude: FloatArray) -> FloatArray:
         """Where a point lies between the true edges."""
         e = self.eccentric / self.inner
-        wave = 0.0
+        wave = np.zeros(len(longitude))
         if self.mode is not None:
             m, amplitude, longitude0 = self.mode
             wave = amplitude * np.cos(m * (longitude - longitude0))

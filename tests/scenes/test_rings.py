@@ -39,6 +39,7 @@ def _pulls(scene: RingScene, navigation: Navigation) -> FloatArray:
     assert estimate is not None
     if estimate.observable_vu is not None:
         assert estimate.along_px is not None
+        assert estimate.sigma_along_px is not None
         return np.array([(estimate.along_px - estimate.observable_vu @ scene.offset_vu) / estimate.sigma_along_px])
     error = estimate.offset_vu - scene.offset_vu
     return np.asarray(np.linalg.solve(np.linalg.cholesky(estimate.covariance), error))
