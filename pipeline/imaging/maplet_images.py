@@ -360,6 +360,94 @@ def _extend(dark, dx, dy, reach, cut):  # type: ignore[no-untyped-def]
                     cut[a, b] = True
 
 
+@dataclass(frozen=True, eq=False)
+class PreparedMaplet(Record):
+    """What does not depend on where in the picture a maplet is looked for.
+
+    Attributes
+    ----------
+    predicted, lit
+        See :func:`predict_image`.
+    hidden
+        (n, n) cells seen at a grazing angle, from behind, or not at all.
+    ray, sun
+        (3,) unit vectors to camera and Sun, maplet frame.
+    """
+
+    predicted: FloatArray
+    lit: BoolArray
+    hidden: BoolArray
+    ray: FloatArray
+    sun: FloatArray
+
+    def __post_init__(self) -> None:
+        n = len(self.predicted)
+        self._freeze(predicted=(n, n), lit=(n, n), hidden=(n, n), ray=(3,), sun=(3,))
+
+
+def prepare_maplet(view: MapletView, maplet: Maplet, options: MapletImageOptions) -> PreparedMaplet:
+    """Predict a maplet and find its hidden cells.
+
+    Parameters
+    ----------
+    view
+        Camera and body.
+    maplet
+        Maplet.
+    options
+        Law and filter.
+
+    Returns
+    -------
+    PreparedMaplet
+        For :func:`images_of`, as often as it is looked for.
+    """
+    to_camera = view.position_km - maplet.landmark_km
+    ray = maplet.maplet_from_body @ (to_camera / np.linalg.norm(to_camera))
+    sun = maplet.maplet_from_body @ view.sun
+    predicted, lit = predict_image(maplet, sun, ray, options)
+    return PreparedMaplet(predicted, lit, _hidden(maplet.heights, ray, options.least_emission), ray, sun)
+
+
+def images_of(
+    prepared: PreparedMaplet, picture: tuple[Image, BoolArray], pixels_vu: FloatArray, jacobian: FloatArray,
+    options: MapletImageOptions,
+) -> MapletImages:  # fmt: skip
+    """Extract and filter one maplet.
+
+    Parameters
+    ----------
+    prepared
+        Prediction.
+    picture
+        (rows, cols) DN; (rows, cols) flags of good pixels.
+    pixels_vu
+        (m, m, 2) places of the cells, m = n + 2 widening (see :func:`grid_pixels`).
+    jacobian
+        (2, 2) pixels per cell at the landmark.
+    options
+        Filter.
+
+    Returns
+    -------
+    MapletImages
+        Ready for correlation.
+    """
+    widening = (len(pixels_vu) - len(prepared.predicted)) // 2
+    area = abs(float(np.linalg.det(jacobian)))
+    extracted, there = extract_image(*picture, pixels_vu, sqrt(area))
+    cut = np.pad(prepared.hidden, widening)
+    dark = there & (extracted <= options.shadow_level * float(extracted[there].mean())) if there.any() else ~there
+    cut |= dark | extend_shadows(dark, prepared.sun, shadow_reach(1.0 / sqrt(area)))
+    inner = slice(widening, widening + len(prepared.predicted))
+    valid = there & ~cut
+    return MapletImages(
+        prepared.predicted, np.where(valid, extracted, 0.0), prepared.lit, valid,
+        int((there & cut)[inner, inner].sum()), float((prepared.predicted > 0).mean()),
+        float(np.arccos(np.clip(prepared.ray[2], -1.0, 1.0))),
+    )  # fmt: skip
+
+
 def maplet_images(
     view: MapletView, maplet: Maplet, picture: tuple[Image, BoolArray], shift_vu: FloatArray, jacobian: FloatArray,
     options: MapletImageOptions, widening: int = 0,
@@ -388,27 +476,8 @@ def maplet_images(
     MapletImages
         Ready for correlation.
     """
-    to_camera = view.position_km - maplet.landmark_km
-    ray = maplet.maplet_from_body @ (to_camera / np.linalg.norm(to_camera))
-    sun = maplet.maplet_from_body @ view.sun
-    predicted, lit = predict_image(maplet, sun, ray, options)
-    area = abs(float(np.linalg.det(jacobian)))
     pixels = grid_pixels(view, maplet, widening) + shift_vu
-    extracted, there = extract_image(*picture, pixels, sqrt(area))
-    cut = _hidden(maplet.heights, ray, options.least_emission)
-    cut = np.pad(cut, widening) if widening else cut
-    dark = there & (extracted <= options.shadow_level * float(extracted[there].mean())) if there.any() else ~there
-    cut |= dark | extend_shadows(dark, sun, shadow_reach(1.0 / sqrt(area)))
-    inner = slice(widening, widening + len(predicted))
-    return MapletImages(
-        predicted,
-        np.where(there & ~cut, extracted, 0.0),
-        lit,
-        there & ~cut,
-        int((there & cut)[inner, inner].sum()),
-        float((predicted > 0).mean()),
-        float(np.arccos(np.clip(ray[2], -1.0, 1.0))),
-    )
+    return images_of(prepare_maplet(view, maplet, options), picture, pixels, jacobian, options)
 
 
 def _hidden(heights: FloatArray, ray: FloatArray, least_emission: float) -> BoolArray:

@@ -14,7 +14,7 @@ import numpy as np
 from pydantic import Field
 
 from pipeline.geometry.maplet import Maplet, MapletView
-from pipeline.imaging.maplet_images import MapletImageOptions, MapletImages, maplet_images
+from pipeline.imaging.maplet_images import MapletImageOptions, MapletImages, grid_pixels, images_of, prepare_maplet
 from pipeline.options import Options
 from pipeline.records import BoolArray, FloatArray, Image, Record
 
@@ -47,7 +47,7 @@ class CorrelationOptions(Options):
     least_correlation: float = Field(0.35, ge=-1, le=1, description="correlation below which nothing was found")
     least_cells: int = Field(100, ge=9, description="cells valid in both images that a correlation needs")
     passes: int = Field(3, ge=1, le=10, description="correlations at bin 1 at most, each on images extracted anew")
-    tolerance_cells: float = Field(0.05, gt=0, description="shift below which no further pass is needed, cells")
+    tolerance_cells: float = Field(0.25, gt=0, description="shift below which no further pass is needed, cells")
 
 
 @dataclass(frozen=True, eq=False)
@@ -241,7 +241,9 @@ def quadratic_peak(surface: FloatArray, place: tuple[int, int]) -> FloatArray | 
     return step if np.abs(step).max() <= 1.5 else None
 
 
-def correlate(images: MapletImages, size: int, pixels_per_cell: float, options: CorrelationOptions) -> Peak:
+def correlate(
+    images: MapletImages, size: int, pixels_per_cell: float, options: CorrelationOptions, with_covariance: bool = True
+) -> Peak:
     """Shift between a maplet's two images.
 
     Parameters
@@ -254,6 +256,8 @@ def correlate(images: MapletImages, size: int, pixels_per_cell: float, options: 
         Root of a cell's area in pixels: tells how far the extracted image's errors are alike.
     options
         Fit and thresholds.
+    with_covariance
+        Without it the peak's covariance is not-a-number, and less work.
 
     Returns
     -------
@@ -281,6 +285,8 @@ def correlate(images: MapletImages, size: int, pixels_per_cell: float, options: 
     if height < options.least_correlation:
         return _nothing(PeakStatus.LOW_CORRELATION, height)
     whole = np.array([i - REACH, j - REACH])
+    if not with_covariance:
+        return Peak(PeakStatus.FOUND, (whole + step) * size, np.full((2, 2), np.nan), height, 0)
     block = max(_BLOCK_CELLS, round(_BLOCK_PX / pixels_per_cell / size))
     covariance, cells = _covariance(predicted, extracted, whole + widening // size, block)
     return Peak(PeakStatus.FOUND, (whole + step) * size, covariance * size**2, height, cells)
@@ -389,11 +395,14 @@ def locate(
     pixels_per_cell = float(np.sqrt(abs(np.linalg.det(jacobian))))
     offset = np.asarray(start_vu, float)
     bins = ladder(match.bin_start, match.every_bin)
+    prepared, grid, before = prepare_maplet(view, maplet, make), grid_pixels(view, maplet), 0
     for step, size in enumerate(bins + (1,) * (match.passes - 1)):
         search = REACH * size
         widening = search if search * pixels_per_cell > _WIDE_SEARCH_PX else 0
-        images = maplet_images(view, maplet, picture, offset, jacobian, make, widening)
-        peak = correlate(images, size, pixels_per_cell, match)
+        if widening != before:
+            grid, before = grid_pixels(view, maplet, widening), widening
+        images = images_of(prepared, picture, grid + offset, jacobian, make)
+        peak = correlate(images, size, pixels_per_cell, match, step >= len(bins) - 1)
         if peak.status is not PeakStatus.FOUND:
             break
         offset = offset + jacobian @ peak.shift_cells

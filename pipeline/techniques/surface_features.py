@@ -178,8 +178,10 @@ def _rounds(
     uncertainty = alignment.factor / 2.0 + _ALIGNMENT_PX
     table: LandmarkTable | None = None
     fit: StarFit | None = None
-    for _ in range(options.rounds):
-        table = _looked_for(search, view, replace(view, camera_from_body=attitude), uncertainty)
+    for number in range(options.rounds):
+        # One look is enough where a better geometry follows.
+        passes = 1 if number + 1 < options.rounds else options.correlation.passes
+        table = _looked_for(search, view, replace(view, camera_from_body=attitude), (uncertainty, passes))
         found = np.flatnonzero(table.found)
         if len(found) < max(options.least_landmarks, 1):
             detail = f"{body.name}: {len(found)} of {len(table)} landmarks found"
@@ -226,12 +228,15 @@ def _state(
         found_state, moved = updated, updated.view.pixels(table.landmark_km)[0]
         if np.abs(moved - places).max() < options.state_tolerance_px:
             break
-        places, table = moved, _looked_for(search, before, updated.view, 0.0)
+        places, table = moved, _looked_for(search, before, updated.view, (0.0, 1))
     return found_state
 
 
-def _looked_for(search: _Search, before: MapletView, view: MapletView, uncertainty_px: float) -> LandmarkTable:
-    """Look for every landmark under a view; rows carry the prediction under the a-priori one."""
+def _looked_for(search: _Search, before: MapletView, view: MapletView, reach: tuple[float, int]) -> LandmarkTable:
+    """Look for every landmark under a view, as far as so many pixels and with so many passes.
+
+    Rows carry the prediction under the a-priori view.
+    """
     index, rows = search.index, search.rows
     jacobians = maplet_jacobian(view, index, rows)
     predicted, now = before.pixels(index.landmark_km[rows])[0], view.pixels(index.landmark_km[rows])[0]
@@ -240,7 +245,7 @@ def _looked_for(search: _Search, before: MapletView, view: MapletView, uncertain
     status = []
     ratio = 1.0 / np.sqrt(np.abs(np.linalg.det(jacobians)))
     for k, maplet in enumerate(search.maplets):
-        match, reason = _match(search, view, maplet, jacobians[k], float(ratio[k]), uncertainty_px)
+        match, reason = _match(search, view, maplet, jacobians[k], float(ratio[k]), reach)
         status.append(reason)
         correlation[k], size[k] = match.correlation, match.bin
         if reason == PeakStatus.FOUND.value:
@@ -260,11 +265,11 @@ def _degrees(cosine: FloatArray) -> FloatArray:
 
 
 def _match(
-    search: _Search, view: MapletView, maplet: Maplet, jacobian: FloatArray, ratio: float, uncertainty_px: float
+    search: _Search, view: MapletView, maplet: Maplet, jacobian: FloatArray, ratio: float, reach: tuple[float, int]
 ) -> tuple[LandmarkMatch, str]:
     options = search.options
-    size = max(1, int(np.ceil(uncertainty_px * ratio / _USABLE_BINS)))
-    correlation = options.correlation.model_copy(update={"bin_start": size})
+    size = max(1, int(np.ceil(reach[0] * ratio / _USABLE_BINS)))
+    correlation = options.correlation.model_copy(update={"bin_start": size, "passes": reach[1]})
     match = locate(view, maplet, search.picture, jacobian, np.zeros(2), (options.images, correlation))
     reason = removal_reason(match.images, ratio, maplet.name, options.removed_by_hand, options.removal)
     return match, match.status.value if reason is MapletReason.USED else reason.name.lower()
