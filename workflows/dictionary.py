@@ -5,8 +5,11 @@
 
 from pathlib import Path
 
+import pyarrow as pa
+
 from pipeline.status import StatusReason, status_of
 from pipeline.tables import SCHEMAS
+from workflows.pose_arcs import ARC_SCHEMA, POSE_SCHEMA
 
 TARGET = Path("outputs/README.md")
 
@@ -37,6 +40,22 @@ _TABLES = {
 }
 
 
+_POSE_TABLES = {
+    "poses": "Of `pilotage pose --arcs`: one row per image of an arc, its smoothed pose and the one it had alone.",
+    "arcs": "Of `pilotage pose --arcs`: one row per arc.",
+}
+
+
+def _describe(parts: list[str], name: str, text: str, schema: pa.Schema) -> None:
+    """Append the section of one table."""
+    parts.append(f"## {name}\n\n{text}\n\n")
+    parts.append("| column | type | unit | meaning |\n|---|---|---|---|\n")
+    for field in schema:
+        said = {key.decode(): value.decode() for key, value in field.metadata.items()}
+        parts.append(f"| `{field.name}` | {field.type} | {said['unit']} | {said['meaning']} |\n")
+    parts.append("\n")
+
+
 def data_dictionary() -> str:
     """Markdown of all tables and of the reasons behind a status.
 
@@ -47,12 +66,9 @@ def data_dictionary() -> str:
     """
     parts = [_HEAD]
     for name, schema in SCHEMAS.items():
-        parts.append(f"## {name}\n\n{_TABLES[name]} Partition columns (`mission`, `camera`) live in the path.\n\n")
-        parts.append("| column | type | unit | meaning |\n|---|---|---|---|\n")
-        for field in schema:
-            text = {key.decode(): value.decode() for key, value in field.metadata.items()}
-            parts.append(f"| `{field.name}` | {field.type} | {text['unit']} | {text['meaning']} |\n")
-        parts.append("\n")
+        _describe(parts, name, f"{_TABLES[name]} Partition columns (`mission`, `camera`) live in the path.", schema)
+    for name, schema in (("poses", POSE_SCHEMA), ("arcs", ARC_SCHEMA)):
+        _describe(parts, name, _POSE_TABLES[name], schema)
     parts.append("## Status and reason\n\n| status | reasons |\n|---|---|\n")
     for status in dict.fromkeys(status_of(reason) for reason in StatusReason):
         reasons = ", ".join(f"`{reason.value}`" for reason in StatusReason if status_of(reason) is status)

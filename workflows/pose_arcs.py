@@ -43,7 +43,17 @@ _TEXT, _REAL, _WHOLE, _FLAG = pa.string(), pa.float64(), pa.int64(), pa.bool_()
 def _pose_fields(prefix: str, what: str) -> list[pa.Field]:
     place = [_field(f"{prefix}{axis}_km", _REAL, "km", f"{what}: position of the camera, body-fixed") for axis in "xyz"]
     turn = [_field(f"{prefix}q{part}", _REAL, "", f"{what}: camera_from_body quaternion") for part in "wxyz"]
-    spread = [_field(f"{prefix}cov_{i}{j}", _REAL, "km, rad", f"{what}: {_COVARIANCE}") for i, j in UPPER]
+    axes = ("x", "y", "z", "rx", "ry", "rz")
+    units = {(False, False): "km2", (False, True): "km rad", (True, True): "rad2"}
+    spread = [
+        _field(
+            f"{prefix}cov_{i}{j}",
+            _REAL,
+            units[i > 2, j > 2],
+            f"{what}: covariance of the errors of {axes[i]} and {axes[j]}",
+        )
+        for i, j in UPPER
+    ]
     return [*place, *turn, *spread]
 
 

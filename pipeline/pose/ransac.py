@@ -19,7 +19,7 @@ _KERNEL_POINTS = 4
 class RansacOptions(Options):
     """Search for a consensus."""
 
-    confidence: float = Field(0.9999, gt=0, lt=1, description="that one sample is free of outliers")
+    confidence: float = Field(0.999, gt=0, lt=1, description="that one sample is free of outliers")
     iterations: int = Field(2000, ge=1, le=1_000_000, description="most samples drawn")
     gate_sigma: float = Field(4.3, gt=0, le=20, description="residual still an inlier, sigmas (1e-4 of a 2-D normal)")
     widen: float = Field(

@@ -22,6 +22,9 @@ class SE3Utils:
     @staticmethod
     def skew(vector: FloatArray) -> FloatArray:
         """(..., 3, 3) matrices of the cross products with (..., 3) vectors."""
+        if np.ndim(vector) == 1:
+            a, b, c = vector
+            return np.array([[0.0, -c, b], [c, 0.0, -a], [-b, a, 0.0]])
         x, y, z = np.moveaxis(np.asarray(vector, dtype=float), -1, 0)
         zero = np.zeros_like(x)
         rows = [np.stack(row, axis=-1) for row in ((zero, -z, y), (z, zero, -x), (-y, x, zero))]
