@@ -15,7 +15,7 @@ import xarray as xr
 import zarr
 from numpy.typing import NDArray
 
-from catalogs.spc_files import MapFile, map_of, maplet_of
+from catalogs.spc_files import RECORD, MapFile, map_of, maplet_of, padding_bytes
 from catalogs.spc_text import LandmarkFile, SpcProblem
 from pipeline.geometry.maplet import Maplet, MapletIndex, vertex_radius_km
 
@@ -98,9 +98,10 @@ class MapletCatalog:
         maplet = self.maplet(number)
         plain = map_of(maplet, float(row["height_step"]))
         spare = bytes(row["spare"].values.tolist())
+        padding = bytes(row["padding"].values.tolist())[: padding_bytes(maplet.half)]
         return MapFile(
             plain.half, plain.scale_km, row["map_landmark"].values, plain.axes, plain.height_step, plain.steps,
-            plain.albedo_steps, row["sigma_direction"].values, float(row["sigma"]), spare,
+            plain.albedo_steps, row["sigma_direction"].values, float(row["sigma"]), spare, padding,
         )  # fmt: skip
 
 
@@ -241,6 +242,7 @@ def _dataset(name: str, file: MapFile, landmark: LandmarkFile | None) -> xr.Data
         "sigma_direction": (("axis",), file.sigma_direction),
         "sigma": ((), file.sigma_km),
         "spare": (("byte",), np.frombuffer(file.spare, np.uint8)),
+        "padding": (("fill",), np.frombuffer(file.padding.ljust(RECORD, b"\0"), np.uint8)),
     }
     data = xr.Dataset({key: (("maplet", *dims), np.asarray(value)[None]) for key, (dims, value) in columns.items()})
     for key, unit in _UNITS.items():

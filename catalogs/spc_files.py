@@ -14,7 +14,7 @@ from catalogs.spc_text import LandmarkFile, SpcProblem
 from pipeline.geometry.maplet import Maplet
 from pipeline.records import FloatArray, Record
 
-_RECORD = 72
+RECORD = 72
 _CELLS_PER_RECORD = 24
 _HEADER = struct.Struct(">6s f 2s 3s 3f 3f 3f 3f f f 1s")
 _CELL = np.dtype([("height", ">i2"), ("albedo", "u1")])
@@ -91,19 +91,19 @@ def read_map(data: bytes, name: str) -> MapFile:
     SpcProblem
         If it is malformed or truncated, with the byte.
     """
-    if len(data) < _RECORD:
-        raise SpcProblem(f"{name}: byte {len(data) + 1}: the file ends within its first record of {_RECORD} bytes")
-    lead, scale, size, direction, *numbers, step, sigma, last = _HEADER.unpack(data[:_RECORD])
+    if len(data) < RECORD:
+        raise SpcProblem(f"{name}: byte {len(data) + 1}: the file ends within its first record of {RECORD} bytes")
+    lead, scale, size, direction, *numbers, step, sigma, last = _HEADER.unpack(data[:RECORD])
     half = int.from_bytes(size, "little")
     _check_header(name, half, scale, np.array(numbers), step, sigma)
     cells = (2 * half + 1) ** 2
-    length = _RECORD * (1 + -(-cells // _CELLS_PER_RECORD))
+    length = RECORD * (1 + -(-cells // _CELLS_PER_RECORD))
     if len(data) != length:
         what = "the file ends here" if len(data) < length else "bytes follow the last record"
         at = min(len(data), length) + 1
         raise SpcProblem(f"{name}: byte {at}: {what}; a half size of {half} takes {length} bytes")
-    end = _RECORD + cells * _CELL.itemsize
-    grid = np.frombuffer(data[_RECORD:end], _CELL).reshape(2 * half + 1, 2 * half + 1)
+    end = RECORD + cells * _CELL.itemsize
+    grid = np.frombuffer(data[RECORD:end], _CELL).reshape(2 * half + 1, 2 * half + 1)
     return MapFile(
         half, scale, np.array(numbers[:3]), np.array(numbers[3:]).reshape(3, 3), step,
         grid["height"].astype(np.int16), grid["albedo"].astype(np.int16), np.array(list(direction), np.int16), sigma,
@@ -123,6 +123,22 @@ def _check_header(name: str, half: int, scale: float, numbers: FloatArray, step:
         raise SpcProblem(f"{name}: byte 64: {step:g} is no step of heights")
     if not (np.isfinite(sigma) and sigma >= 0):
         raise SpcProblem(f"{name}: byte 68: {sigma:g} km is no uncertainty")
+
+
+def padding_bytes(half: int) -> int:
+    """Bytes that fill the last record of a map.
+
+    Parameters
+    ----------
+    half
+        Half size in cells.
+
+    Returns
+    -------
+    int
+        0 to 71.
+    """
+    return -((2 * half + 1) ** 2) * _CELL.itemsize % RECORD
 
 
 def write_map(file: MapFile) -> bytes:
@@ -145,7 +161,7 @@ def write_map(file: MapFile) -> bytes:
     grid = np.empty(file.steps.shape, _CELL)
     grid["height"], grid["albedo"] = file.steps, file.albedo_steps
     body = grid.tobytes() + file.padding
-    return header + body + bytes(-len(body) % _RECORD)
+    return header + body + bytes(-len(body) % RECORD)
 
 
 def maplet_of(file: MapFile, name: str, landmark: LandmarkFile | None = None) -> Maplet:

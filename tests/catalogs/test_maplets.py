@@ -47,7 +47,10 @@ def spc_folder(root: Path) -> Path:
     for kind in ("MAPFILES", "LMKFILES", "SUMFILES"):
         (root / kind).mkdir(parents=True)
     for name, half in (("ENDFIL", 49), ("EE0426", 11)):
-        (root / "MAPFILES" / f"{name}.MAP").write_bytes(write_map(real_map(half)))
+        data = bytearray(write_map(real_map(half)))
+        # Filling bytes mean nothing and are kept all the same.
+        data[-1] = 77 if half == 49 else data[-1]
+        (root / "MAPFILES" / f"{name}.MAP").write_bytes(data)
     (root / "LMKFILES" / "ENDFIL.LMK").write_bytes(write_landmark(landmark()))
     (root / "SUMFILES" / "W1.SUM").write_bytes(write_picture(picture()))
     return root

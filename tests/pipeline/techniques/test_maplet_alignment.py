@@ -50,8 +50,8 @@ def test_a_twist_is_found_with_its_sign() -> None:
     cells = light_of(VIEW, maplets(), MapletImageOptions())
     image = picture_of(SURFACE, VIEW, np.zeros(2), beta)
     pivot = (cells.pixels_vu.min(axis=0) + cells.pixels_vu.max(axis=0)) / 2
-    image = turned_about(image, pivot, np.radians(angle_deg)).astype(np.float32)
-    found = align(cells, (image, np.ones(image.shape, bool)), (10, 10), np.radians(4.0))
+    turned = turned_about(image, pivot, np.radians(angle_deg)).astype(np.float32)
+    found = align(cells, (turned, np.ones(turned.shape, bool)), (10, 10), np.radians(4.0))
     assert found is not None
     assert np.degrees(found.rotation_rad) == pytest.approx(angle_deg, abs=1.3)
     assert found.offset_vu == pytest.approx([0.0, 0.0], abs=1.0)
@@ -59,7 +59,7 @@ def test_a_twist_is_found_with_its_sign() -> None:
 
 def test_nothing_to_align_is_told() -> None:
     image = np.full((50, 50), 3.0, np.float32)
-    good = np.ones(image.shape, bool)
+    good = np.ones((50, 50), bool)
     assert align(light_of(VIEW, [], MapletImageOptions()), (image, good), (5, 5), 0.0) is None
     cells = light_of(VIEW, maplets(), MapletImageOptions())
-    assert align(cells, (image, np.zeros(image.shape, bool)), (5, 5), 0.0) is None
+    assert align(cells, (image, np.zeros((50, 50), bool)), (5, 5), 0.0) is None

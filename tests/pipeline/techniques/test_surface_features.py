@@ -25,7 +25,7 @@ HALF = 17
 def source() -> MapletSource:
     """Grid of overlapping maplets, cut from the formula."""
     whole = maplet_on(SURFACE, 95, 0.05)
-    maplets = []
+    maplets: list[Maplet] = []
     for i in range(-72, 73, 24):
         for j in range(-72, 73, 24):
             part = (slice(95 + i - HALF, 95 + i + HALF + 1), slice(95 + j - HALF, 95 + j + HALF + 1))
