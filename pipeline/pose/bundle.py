@@ -159,7 +159,11 @@ class _Problem:
         params.setMaxIterations(self.options.max_iterations)
         params.setRelativeErrorTol(self.options.relative_tolerance)
         params.setOrdering(_points_first(points, poses))
-        result = gtsam.LevenbergMarquardtOptimizer(graph, values, params).optimize()
+        try:
+            result = gtsam.LevenbergMarquardtOptimizer(graph, values, params).optimize()
+        except RuntimeError as error:
+            # GTSAM's own: a point or a view that its sightings leave free.
+            raise MatchError(f"the views do not determine each other: {str(error).strip().splitlines()[0]}") from error
         found = {view: SE3Utils.from_gtsam(result.atPose3(pose_key(view))) for view in poses}
         places = np.full(places_km.shape, np.nan)
         if len(points):

@@ -80,7 +80,9 @@ def triangulate_views(
     known = np.isin(sightings.view, list(poses))
     view, point = sightings.view[known], sightings.point[known]
     plane = to_plane(camera, sightings.pixels_vu[known], sightings.covariance(sigma_px)[known])
-    good = plane.ok
+    # A sighting without an honest sigma fails its own view, and no other.
+    spread = sightings.covariance(sigma_px)[known]
+    good = plane.ok & np.isfinite(spread).all(axis=(1, 2)) & (spread[:, 0, 0] > 0) & (np.linalg.det(spread) > 0)
     order = np.array(sorted(poses))
     row = np.searchsorted(order, view[good])
     turns = np.stack([poses[int(k)].camera_from_body for k in order])[row]

@@ -166,10 +166,14 @@ def _broken(kind: str, table: pd.DataFrame) -> pd.DataFrame:
     elif kind == "sigma":
         table["cov_vv"], table["cov_vu"], table["cov_uu"] = 0.1, 0.0, 0.1
         table.loc[table.index[table.view_id == 40][3], "cov_vv"] = -0.1
+    elif kind == "zero":
+        table["cov_vv"], table["cov_vu"], table["cov_uu"] = 0.1, 0.0, 0.1
+        table.loc[table.index[table.view_id == 30][3], ["cov_vv", "cov_uu"]] = 0.0
+        table.loc[table.index[table.view_id == 40][3], ["cov_vv", "cov_uu"]] = 0.0
     return table
 
 
-@pytest.mark.parametrize(("kind", "view"), [("nan", 40), ("doubled", 40), ("sigma", 40)])
+@pytest.mark.parametrize(("kind", "view"), [("nan", 40), ("doubled", 40), ("sigma", 40), ("zero", 40)])
 def test_a_bad_view_is_one_line_and_the_others_stay(tmp_path: Path, kind: str, view: int) -> None:
     table, poses, _ = _views(3)
     _broken(kind, table).to_parquet(tmp_path / "m.parquet")

@@ -263,3 +263,21 @@ def test_the_fit_descends_from_afar() -> None:
     assert far.chi2 == pytest.approx(near.chi2, rel=1e-6)
     away = SE3Utils.error(far.pose, near.pose)
     assert away @ SE3Utils.error_from_correction(near.information) @ away < 1e-6
+
+
+def test_degenerate_grids_end_in_a_pose_or_in_a_reason() -> None:
+    rng = np.random.default_rng(11)
+    calibration, outcomes = CameraCalibration.of(CAMERAS[2], DATUM), {"pose": 0, "reason": 0}
+    for _ in range(80):
+        n = int(rng.integers(6, 14))
+        points = np.round(rng.uniform(-2, 2, (n, 3))) + AHEAD
+        pixels = np.round(_seen(points, float(rng.choice([0.01, 1.0, 30.0]))).pixels_vu)
+        stated = None if rng.random() < 0.5 else np.tile(np.eye(2), (n, 1, 1))
+        matches = MatchResult("x", np.arange(n), pixels, points, stated)
+        try:
+            estimate = OpenCVGtsamPoseEstimator().estimate(matches, calibration, COOL)
+            assert np.linalg.eigvalsh(estimate.covariance_6x6)[0] > 0
+            outcomes["pose"] += 1
+        except PnpFailureError:
+            outcomes["reason"] += 1
+    assert min(outcomes.values()) >= 5
