@@ -29,12 +29,15 @@ LEVELS = (
 FOUNDATIONS = {
     "geometry": ("rotations", "shape", "rays", "maplet"),
     "imaging": ("psf", "illumination", "render"),
-    "pose": ("records", "se3", "normalise", "refine", "pnp", "ransac", "graph", "estimator", "triangulation", "views", "bundle", "arc_factors", "arcs"),
+    "pose": (
+        "records", "se3", "normalise", "refine", "pnp", "ransac", "graph",
+        "estimator", "triangulation", "views", "bundle", "arc_factors", "arcs",
+    ),
     "predict": ("body_view", "bodies", "maplets"),
     "techniques": (
         "base", "star_fit", "star_match", "star_search", "star_inventory", "body_base", "body_search", "model_errors",
-        "template_fit", "body_minor", "contour_fit", "lm", "line_search", "relief", "ring_units", "ring_solve", "ring_fit",
-        "ring_search", "ring_answer",
+        "template_fit", "body_minor", "contour_fit", "lm", "line_search", "relief", "ring_units", "ring_solve",
+        "ring_fit", "ring_search", "ring_answer",
         "maplet_correlation", "maplet_alignment", "landmark_table", "landmark_state",
     ),
 }  # fmt: skip
@@ -45,8 +48,8 @@ OUTSIDE_OF_SCIENCE = {
 # Schemas are Arrow's, which is not a file.
 ORDER_OF_CATALOGS = (
     "instruments", "label_text", "raw_images", "fits_images", "pds3_images", "gdal_images", "images", "labels",
-    "bodies", "shapes", "geometry", "ring_catalog", "header", "sidecar", "index_tables", "selection", "archive", "listing", "kernels",
-    "spice", "star_sources", "stars", "spc_text", "spc_files", "maplets",
+    "bodies", "shapes", "geometry", "ring_catalog", "header", "sidecar", "index_tables", "selection", "archive",
+    "listing", "kernels", "spice", "star_sources", "stars", "spc_text", "spc_files", "maplets",
 )  # fmt: skip
 
 

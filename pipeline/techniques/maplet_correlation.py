@@ -289,6 +289,10 @@ def correlate(
         return Peak(PeakStatus.FOUND, (whole + step) * size, np.full((2, 2), np.nan), height, 0)
     block = max(_BLOCK_CELLS, round(_BLOCK_PX / pixels_per_cell / size))
     covariance, cells = _covariance(predicted, extracted, whole + widening // size, block)
+    both = quadratic_peak(surface, (i, j))
+    if both is not None:
+        # The series per axis leaves out how the axes are tied together: what that moves the peak by is its error.
+        covariance = covariance + np.diag((both - step) ** 2)
     return Peak(PeakStatus.FOUND, (whole + step) * size, covariance * size**2, height, cells)
 
 

@@ -182,3 +182,26 @@ def test_one_maplet_takes_a_few_milliseconds() -> None:
         seconds.append(time.process_time() - start)
     # 8 ms on a quiet machine; twice that where others work too.
     assert min(seconds) < 0.016
+
+
+def test_both_sub_pixel_fits_own_up_to_their_errors() -> None:
+    """Offsets between whole cells, where interpolation and the fits' own forms are all that is wrong."""
+    maplet = maplet_on(SURFACE, 30, 0.05)
+    rng = np.random.default_rng(8)
+    pulls: dict[str, list[float]] = {"quadratic": [], "taylor": []}
+    for _ in range(5):
+        view = view_down(0.05, float(rng.uniform(0.05, 0.4)), float(rng.uniform(0, 6)), SUN, 90)
+        phase = np.arccos(view.sun @ view.position_km / 100.0)
+        offset = rng.uniform(-2, 2, 2)
+        clean = picture_of(SURFACE, view, offset, float(np.exp(-np.degrees(phase) / 60)))
+        image = (clean + rng.normal(size=clean.shape) * 0.05 * clean.std()).astype(np.float32)
+        jacobian = maplet_jacobian(view, index_of([maplet]), np.array([0]))[0]
+        for name, found in pulls.items():
+            correlation = CorrelationOptions.model_validate({"subpixel": name})
+            good = np.ones(image.shape, bool)
+            match = locate(view, maplet, (image, good), jacobian, np.zeros(2), (MapletImageOptions(), correlation))
+            root = np.linalg.cholesky(match.covariance_px2)
+            found.extend(np.linalg.solve(root, match.offset_vu - offset))
+    # Ten squares each: mean 1, sigma 0.45.
+    assert np.mean(np.square(pulls["quadratic"])) < 2.8
+    assert np.mean(np.square(pulls["taylor"])) < 2.8
