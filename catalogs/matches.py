@@ -9,10 +9,10 @@ import pandas as pd
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from pipeline.errors import ConfigurationError
-from pipeline.geometry.wgs84 import Datum, wgs84
+from pipeline.errors import ConfigurationError, ContractError
+from pipeline.geometry.wgs84 import Datum, Geoid, wgs84
 from pipeline.pose.normalise import pinhole_camera
-from pipeline.pose.records import MatchError, Pose
+from pipeline.pose.records import CameraCalibration, MatchError, Pose
 from pipeline.records import CameraModel, FloatArray, Record
 
 _REQUIRED = ("view_id", "point_id", "v_px", "u_px")
@@ -98,18 +98,15 @@ class Cameras:
 
     Attributes
     ----------
-    camera
-        The one camera of all views.
-    datum
-        Ellipsoid of the body.
+    calibration
+        The one camera of all views, its mounting, the datum of the body and, where the file brings one, its geoid.
     poses
         Given poses by view id, in the order of the file.
     arcs
         Arcs, if the file has any.
     """
 
-    camera: CameraModel
-    datum: Datum
+    calibration: CameraCalibration
     poses: dict[int, Pose]
     arcs: tuple[Arc, ...] = ()
 
@@ -199,7 +196,8 @@ def read_cameras(data: bytes, name: str) -> Cameras:
         ``{K, shape_vu, views: [{view_id, position_km, camera_from_body}], datum: {name, radii_km}}``; K maps (x, y, 1)
         to (u, v, 1). In the place of K, ``camera_model`` as in a sidecar. Without a datum WGS 84 is meant. Optional
         ``arcs: [{arc_id, options, views: [{view_id, et, position_km, camera_from_body, throttled}]}]`` with what was
-        believed of each pose.
+        believed of each pose; ``vehicle: {camera_from_vehicle, camera_in_vehicle_m}``, the mounting; and
+        ``geoid: {lat_deg, lon_deg, height_m}``, a grid of heights of mean sea level above the ellipsoid.
     name
         For messages.
 
@@ -219,16 +217,22 @@ def read_cameras(data: bytes, name: str) -> Cameras:
         poses = {int(view["view_id"]): _pose(view) for view in views}
         doubled = len(poses) < len(views)
         datum = Datum(content["datum"]["name"], content["datum"]["radii_km"]) if "datum" in content else wgs84()
-        camera = _camera(content)
+        mounting, geoid = content.get("vehicle", {}), content.get("geoid")
+        calibration = CameraCalibration(
+            _camera(content), datum, mounting.get("camera_from_vehicle", np.eye(3)),
+            mounting.get("camera_in_vehicle_m", np.zeros(3)),
+            None if geoid is None else Geoid(geoid["lat_deg"], geoid["lon_deg"], geoid["height_m"]),
+        )  # fmt: skip
         arcs = tuple(_arc(arc) for arc in content.get("arcs", []))
-    except (ValueError, TypeError, KeyError) as error:
+    except (ValueError, TypeError, KeyError, AttributeError) as error:
         what = f"no {error}" if isinstance(error, KeyError) else str(error)
         raise ConfigurationError(f"{name}: {what}") from error
-    except MatchError as error:
+    except (MatchError, ContractError) as error:
+        # A record's own check, of what the file says.
         raise ConfigurationError(f"{name}: {error}") from error
     if doubled:
         raise ConfigurationError(f"{name}: a view is given twice")
-    return Cameras(camera, datum, poses, arcs)
+    return Cameras(calibration, poses, arcs)
 
 
 def _pose(view: dict[str, FloatArray]) -> Pose:

@@ -154,7 +154,7 @@ def prepare(table: MatchTable, cameras: Cameras) -> Views:
     points, point = _ranked(table.point_id)
     sightings = Sightings(view[: len(table.view_id)], point, table.pixels_vu, table.pixel_covariance_px2)
     given = {int(np.searchsorted(ids, key)): pose for key, pose in cameras.poses.items()}
-    calibration = CameraCalibration.of(cameras.camera, cameras.datum)
+    calibration = cameras.calibration
     throttled = frozenset(view.view_id for arc in cameras.arcs for view in arc.views if view.throttled)
     plain = Views(ids, points, sightings, given, False, calibration, PoseOptions(), table, throttled)
     if table.points_km is not None:
@@ -165,9 +165,9 @@ def prepare(table: MatchTable, cameras: Cameras) -> Views:
     given = {key: turned(pose) for key, pose in given.items()} if away else given
     options = PoseOptions()
     if table.pixel_covariance_px2 is None:
-        places = triangulate_views(cameras.camera, sightings, given, len(points), options.assumed_sigma_px)
+        places = triangulate_views(calibration.camera, sightings, given, len(points), options.assumed_sigma_px)
         if places.ok.any():
-            sigma = sigma_of(cameras.camera, sightings, given, places.places_km)
+            sigma = sigma_of(calibration.camera, sightings, given, places.places_km)
             options = PoseOptions(assumed_sigma_px=max(sigma, 1e-6))
     return Views(ids, points, sightings, given, away, calibration, options, table, throttled)
 

@@ -11,7 +11,7 @@ from pipeline.errors import ConfigurationError
 from pipeline.geometry.rotations import quaternion_from_matrix
 from pipeline.pose.arc_factors import ArcImage
 from pipeline.pose.arcs import ArcOptions, ArcResult, smooth_arc
-from pipeline.pose.estimator import place_of
+from pipeline.pose.estimator import place_of, vehicle_orientation
 from pipeline.pose.records import (
     CameraCalibration,
     MatchError,
@@ -75,6 +75,8 @@ POSE_SCHEMA = pa.schema([
     _field("alt_m", _REAL, "m", "above mean sea level, smoothed; null without a geoid"),
     _field("ellipsoidal_m", _REAL, "m", "above the ellipsoid of the datum, smoothed"),
     _field("datum", _TEXT, "", "name of the ellipsoid"),
+    *[_field(f"vehicle_q{part}", _REAL, "", "quaternion that turns vehicle axes onto body-fixed ones, smoothed")
+      for part in "wxyz"],
     *_pose_fields("", "smoothed"),
     *_pose_fields("raw_", "image alone"),
 ], metadata={"frame": "body-fixed; x_camera = camera_from_body (X - position)", "covariance": _COVARIANCE})  # fmt: skip
@@ -170,6 +172,8 @@ def _pose_row(
         "lat_deg": place.lat_deg, "lon_deg": place.lon_deg, "alt_m": place.alt_m,
         "ellipsoidal_m": place.ellipsoidal_m, "datum": place.datum, "outlier": False,
     }  # fmt: skip
+    vehicle = vehicle_orientation(pose, calibration)
+    row |= {f"vehicle_q{part}": float(vehicle[k]) for k, part in enumerate("wxyz")}
     row |= _numbers("", pose, result.covariance[index])
     if isinstance(answer, PoseEstimate):
         row |= _numbers("raw_", answer.pose, answer.covariance_6x6)

@@ -206,6 +206,10 @@ def test_a_bad_table_is_one_error(tmp_path: Path, change, message: str) -> None:
     (lambda c: c["views"][0]["position_km"].__setitem__(0, float("nan")), "view 0: position_km is not finite"),
     (lambda c: c["views"][0]["position_km"].pop(), "three numbers"),
     (lambda c: c["views"].clear(), "fewer than two views"),
+    (lambda c: c.update(datum={"name": "x", "radii_km": [1, -1, 1]}), "must be positive"),
+    (lambda c: c.update(geoid={"lat_deg": [1, 0], "lon_deg": [0, 1], "height_m": [[0, 0], [0, 0]]}), "ascending"),
+    (lambda c: c.update(vehicle={"camera_from_vehicle": [[1, 0, 0]] * 3}), "camera_from_vehicle is not a rotation"),
+    (lambda c: c.update(views=3), "not iterable"),
 ])  # fmt: skip
 def test_bad_cameras_are_one_error(tmp_path: Path, change, message: str) -> None:  # type: ignore[no-untyped-def]
     table, poses, _ = _views(4)

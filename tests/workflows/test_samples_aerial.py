@@ -116,6 +116,24 @@ def test_absurd_choices_are_refused(tmp_path: Path, options: AerialOptions, mess
         make_aerial_sample(tmp_path / "x", options)
 
 
+def test_mounting_and_geoid_of_the_file_reach_the_table(
+    flight: Path, solved: tuple[pd.DataFrame, pd.DataFrame], tmp_path: Path
+) -> None:
+    content = json.loads((flight / "cameras.json").read_text())
+    content["vehicle"] = {"camera_from_vehicle": [[0, 1, 0], [-1, 0, 0], [0, 0, 1]], "camera_in_vehicle_m": [0, 0, 3.0]}
+    content["geoid"] = {"lat_deg": [40, 50], "lon_deg": [30, 40], "height_m": [[20, 20], [20, 20]]}
+    (tmp_path / "cameras.json").write_text(json.dumps(content))
+    arguments = [str(flight / "matches.parquet"), "--cameras", str(tmp_path / "cameras.json")]
+    CliRunner().invoke(app, ["pose", *arguments, "-o", str(tmp_path / "p"), "--arcs", str(tmp_path)])
+    poses, plain = pd.read_parquet(tmp_path / "poses.parquet"), solved[0]
+    np.testing.assert_allclose(poses.ellipsoidal_m - poses.alt_m, 20.0, atol=1e-9)
+    # The camera hangs three metres below, within the wobble of the airframe.
+    np.testing.assert_allclose(poses.ellipsoidal_m - plain.ellipsoidal_m, 3.0, atol=0.1)
+    camera = matrix_from_quaternion(poses.loc[0, ["qw", "qx", "qy", "qz"]].to_numpy(float))
+    vehicle = matrix_from_quaternion(poses.loc[0, [f"vehicle_q{part}" for part in "wxyz"]].to_numpy(float))
+    np.testing.assert_allclose(camera @ vehicle, content["vehicle"]["camera_from_vehicle"], atol=1e-12)
+
+
 def test_bad_arcs_are_one_error(flight: Path, tmp_path: Path) -> None:
     content = json.loads((flight / "cameras.json").read_text())
     for change, message in (

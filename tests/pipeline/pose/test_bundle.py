@@ -8,7 +8,7 @@ from pipeline.pose.bundle import adjust
 from pipeline.pose.records import MatchError, Pose, PosePrior
 from pipeline.pose.se3 import SE3Utils
 from pipeline.pose.views import Sightings, looks_away, sigma_of, triangulate_views, turned
-from pipeline.records import FloatArray
+from pipeline.records import BoolArray, FloatArray
 from tests.pipeline.pose.scenes import CAMERAS
 
 CAMERA = CAMERAS[2]
@@ -23,7 +23,7 @@ def _pose(angle: float) -> Pose:
     return Pose(np.stack([x, np.cross(z, x), z]), place)
 
 
-def _views(seed: int, wrong: float = 0.02) -> tuple[Sightings, list[Pose], FloatArray, FloatArray]:
+def _views(seed: int, wrong: float = 0.02) -> tuple[Sightings, list[Pose], FloatArray, BoolArray]:
     rng = np.random.default_rng(seed)
     poses = [_pose(angle) for angle in np.linspace(0, 0.6, 6)]
     points = rng.uniform(-2, 2, (POINTS, 3))
