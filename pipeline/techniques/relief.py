@@ -217,13 +217,14 @@ def _likeliest(
     absent, present = np.log(1.0 - options.wrong_shape_chance), np.log(options.wrong_shape_chance)
     long_prior = np.where(_LONG_FACTORS > 0, present - np.log(len(_LONG_FACTORS) - 1), absent)
 
-    # A long-wave error is part of what is not known of a shape that nobody vouches for, and of any shape on a short
-    # arc, which cannot show it: over the catalogue's relief where there is one, else over what the outline shows.
     known = all(f.known for f in fields.values())
-    least = 0.0 if known and span_deg > _SHORT_ARC_DEG else _UNKNOWN_LONG
 
     def long_wave(f: float, g: float) -> float:
-        return max(g, least if known else _SHOWN_LONG * f)
+        # A long-wave error is part of what is not known of any shape on a short arc, which cannot show it, and of a
+        # shape that nobody vouches for.
+        if span_deg <= _SHORT_ARC_DEG:
+            return max(g, _UNKNOWN_LONG)
+        return g if known else max(g, _SHOWN_LONG * f)
 
     def score(f: float, g: float) -> float:
         return _restricted_likelihood(shift, design, base + f**2 * near + long_wave(f, g) ** 2 * far)
