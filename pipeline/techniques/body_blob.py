@@ -36,8 +36,8 @@ _SETTLED_PX = 0.02
 _LIT_SHARE = 0.05
 # A blob is told from others by size alone.
 _SURE = 0.99
-# Slope of the sky over half the cutout, relative to the brightness.
-_SKY_SLOPE_SHARE = 0.02
+# Rise of stray light over half the array, relative to the brightness.
+_STRAY_SHARE = 0.1
 
 
 class BodyBlobOptions(TechniqueOptions):
@@ -260,9 +260,9 @@ def _covariance(cutout: Cutout, frame: Frame, moment: _Moment, errors: ModelErro
     pull = lever.sum(axis=0)
     covariance += sky_variance * np.outer(pull, pull)
     v, u = (index.astype(float) for index in np.nonzero(support))
-    half = max(support.shape) / 2.0
+    half = max(frame.raw.shape) / 2.0
     for place in (v, u):
-        ramp = lever.T @ ((place - place.mean()) / half) * _SKY_SLOPE_SHARE * moment.scale
+        ramp = lever.T @ ((place - place.mean()) / half) * _STRAY_SHARE * moment.scale
         covariance += np.outer(ramp, ramp)
     slope = moment.scale * np.hypot(template.along_v, template.along_u)[support].astype(float)
     covariance += correlated_sums(lever, errors.texture * light, (v, u), errors.texture_px)
