@@ -5,8 +5,9 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
-from pipeline.camera import project
+from pipeline.camera import project, unproject
 from pipeline.geometry.ellipsoid import is_visible, limb_points, silhouette_form, surface_normal, terminator_points
 from pipeline.imaging.render import Template
 from pipeline.predict.body_view import BodyView
@@ -17,6 +18,8 @@ _FEWEST, _MOST = 48, 4000
 _LEAST_MU0 = 0.1
 # Pixels by which a place is moved to see what lies on either side of a mesh's outline.
 _BESIDE_PX = 2.0
+# Facets around a place of which the nearest to the camera is taken for the one that is seen there.
+_FACETS_AROUND = 6
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,7 +88,7 @@ def limb_outline(views: tuple[BodyView, ...], camera: CameraModel, template: Tem
     parts = []
     for index, view in enumerate(views):
         if view.body.mesh is not None:
-            parts += _mesh_outline(view, index, template, at_limb=True)
+            parts += _mesh_outline(view, index, template, camera, at_limb=True)
             continue
         angle = _angles(view)
         points = limb_points(view.body.radii_km, view.observer_km, angle)
@@ -114,7 +117,7 @@ def terminator_outline(
     parts = []
     for index, view in enumerate(views):
         if view.body.mesh is not None:
-            parts += _mesh_outline(view, index, template, at_limb=False)
+            parts += _mesh_outline(view, index, template, camera, at_limb=False)
             continue
         points = terminator_points(view.body.radii_km, view.sun_from_body, _angles(view))
         seen = is_visible(view.body.radii_km, view.observer_km, points)
@@ -181,7 +184,9 @@ def _hidden(in_camera: FloatArray, view: BodyView, views: tuple[BodyView, ...]) 
     return hidden
 
 
-def _mesh_outline(view: BodyView, index: int, template: Template | None, at_limb: bool) -> list[Outline]:
+def _mesh_outline(
+    view: BodyView, index: int, template: Template | None, camera: CameraModel, at_limb: bool
+) -> list[Outline]:
     """Border of the lit part of a drawn mesh: against the sky its limb, against its own night the terminator."""
     if template is None or not template.window.pixels:
         return []
@@ -204,10 +209,37 @@ def _mesh_outline(view: BodyView, index: int, template: Template | None, at_limb
     behind[inside] = template.cover[beside[inside, 0], beside[inside, 1]]
     wanted = inside & ((behind < 0.5) if at_limb else (behind >= 0.5))
     seen = places[wanted] + [template.window.v0, template.window.u0]
-    across = (seen - view.centre_vu) / max(view.diameter_px / 2, 1.0)
-    direction = np.concatenate([across, np.full((len(seen), 1), 0.3)], axis=1)
-    direction /= np.linalg.norm(direction, axis=1)[:, None]
+    direction = _directions_on_mesh(view, camera, seen)
     count = len(seen)
     return [
         Outline(seen, normal[wanted], direction, np.full(count, index), np.ones(count, bool), np.full(count, "", "U8"))
     ]
+
+
+def _directions_on_mesh(view: BodyView, camera: CameraModel, places_vu: FloatArray) -> FloatArray:
+    """(n, 3) unit vectors from a mesh's centre to what is seen at places, camera axes.
+
+    The range is that of the nearest facing facet by its image: on an elongated body pixels alone would not tell how far
+    two places are apart on it.
+    """
+    mesh = view.body.mesh
+    assert mesh is not None
+    if not len(places_vu):
+        return np.zeros((0, 3))
+    corners = (mesh.vertices_km @ view.camera_from_body.T + view.centre_km)[mesh.facets]
+    middle = corners.mean(axis=1)
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    middle = middle[(normal * middle).sum(axis=1) < 0]
+    pixels, ahead = project(camera, middle)
+    ahead &= np.isfinite(pixels).all(axis=1)
+    if not ahead.any():
+        return np.tile([0.0, 0.0, -1.0], (len(places_vu), 1))
+    depth = middle[ahead, 2]
+    around = min(_FACETS_AROUND, len(depth))
+    gap, facet = cKDTree(pixels[ahead], compact_nodes=False, balanced_tree=False).query(places_vu, k=around)
+    gap, facet = gap.reshape(-1, around), facet.reshape(-1, around)
+    seen = np.where(gap <= gap[:, :1] + _BESIDE_PX, depth[facet], np.inf).min(axis=1)
+    rays, ok = unproject(camera, places_vu)
+    points = np.where(ok[:, None], rays / rays[:, 2:] * seen[:, None], view.centre_km - [0.0, 0.0, 1.0])
+    direction = points - view.centre_km
+    return np.asarray(direction / np.linalg.norm(direction, axis=1)[:, None])

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
+from pipeline.camera import unproject
+from pipeline.geometry.ellipsoid import intersect
 from pipeline.geometry.rotations import rotation_about
 from pipeline.imaging.render import Window
 from pipeline.predict.bodies import BodyPredictionOptions, predict_bodies
@@ -123,6 +125,32 @@ def test_a_meshs_outlines_are_drawn_ones() -> None:
     assert float(gap.max()) < 2.0
     assert ((outline.normal_vu * (outline.vertices_vu - CENTRE)).sum(axis=1) > 0).all()
     assert not len(limb_outline(scene.views, PINHOLE))  # nothing is drawn without a template
+
+
+@pytest.mark.parametrize("at_limb", [True, False], ids=["limb", "terminator"])
+def test_places_on_a_mesh_lie_apart_as_on_the_body(at_limb: bool) -> None:
+    body = body_at(PINHOLE, CENTRE, RADIUS, 70.0, axes=(1.6, 0.7, 0.7), body_from_j2000=TILTED)
+    # Rings of latitude and a spoke at each pole of the same ellipsoid.
+    latitude, longitude = np.meshgrid(np.linspace(-np.pi / 2, np.pi / 2, 61), np.linspace(0, 2 * np.pi, 121)[:-1])
+    ball = np.stack([np.cos(latitude) * np.cos(longitude), np.cos(latitude) * np.sin(longitude), np.sin(latitude)], 2)
+    at = np.arange(latitude.size).reshape(latitude.shape)
+    a, b, c, d = at[:, :-1], np.roll(at, -1, 0)[:, :-1], np.roll(at, -1, 0)[:, 1:], at[:, 1:]
+    facets = np.concatenate([np.stack(f, 2).reshape(-1, 3) for f in ((a, b, c), (a, c, d))])
+    meshed = replace(body, mesh=TriangleMesh(ball.reshape(-1, 3) * body.radii_km, facets))
+    scene = predict_bodies(body_state((meshed,), PINHOLE), 0.8, BodyPredictionOptions())
+    template = scene.render(scene.views, Window(0, 0, *SHAPE))
+    outline = (limb_outline if at_limb else terminator_outline)(scene.views, PINHOLE, template)
+    assert len(outline) > 20
+    # What a ray through the same pixel meets on the closed form.
+    view = scene.views[0]
+    inward = outline.vertices_vu - (0.7 if at_limb else 0.0) * outline.normal_vu
+    rays, _ = unproject(PINHOLE, inward)
+    points, hit = intersect(body.radii_km, view.observer_km, rays @ view.camera_from_body)
+    assert hit.mean() > 0.95
+    expected = points[hit] @ view.camera_from_body.T
+    cosine = (expected / np.linalg.norm(expected, axis=1)[:, None] * outline.direction[hit]).sum(axis=1)
+    assert float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))).max()) < 12.0
+    assert_allclose(np.linalg.norm(outline.direction, axis=1), 1.0)
 
 
 def test_nothing_joined_is_an_outline() -> None:
