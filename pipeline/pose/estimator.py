@@ -16,7 +16,7 @@ from pipeline.options import Options
 from pipeline.pose.graph import SharedGraph, posterior, shared_posterior
 from pipeline.pose.normalise import PlanePoints, to_plane
 from pipeline.pose.pnp import refuse_degenerate, starting_poses
-from pipeline.pose.ransac import RansacFilter, RansacOptions, log10_false_alarms
+from pipeline.pose.ransac import Consensus, RansacFilter, RansacOptions, log10_false_alarms
 from pipeline.pose.records import (
     CameraCalibration,
     CovarianceDegradedWarning,
@@ -180,12 +180,24 @@ class OpenCVGtsamPoseEstimator:
         sigma = np.sqrt(np.trace(covariance, axis1=1, axis2=2) / 2.0)
         if len(points) >= self.options.ransac.min_inliers:
             refuse_degenerate(points, xy, float(np.median(sigma)))
-        consensus = self._ransac.filter(points, xy, sigma)
+        # Most scenes need few samples, since what they miss is found by refining; the rest are searched thoroughly.
+        for confidence in (self.options.ransac.first_confidence, self.options.ransac.confidence):
+            try:
+                return self._attempt(
+                    matches, self._ransac.filter(points, xy, sigma, confidence), float(np.median(sigma))
+                )
+            except PnpFailureError as failure:
+                last = failure
+        raise last
+
+    def _attempt(self, matches: _Matches, consensus: Consensus, sigma: float) -> _Solution:
+        """Solution from one consensus, or the reason why it is none."""
+        usable = matches.plane.ok
         first = np.flatnonzero(usable)[consensus.inlier]
         start = np.zeros(len(usable), dtype=bool)
         start[first] = True
-        points, xy, covariance, _ = matches.take(start)
-        shape = refuse_degenerate(points, xy, float(np.median(sigma)))
+        points, xy, _, _ = matches.take(start)
+        shape = refuse_degenerate(points, xy, sigma)
         found = self._settle_all(matches, start, starting_poses(points, xy, shape))
         found = found or self._settle_all(matches, start, [("ransac", consensus.pose)])
         if not found:

@@ -20,6 +20,7 @@ class RansacOptions(Options):
     """Search for a consensus."""
 
     confidence: float = Field(0.999, gt=0, lt=1, description="that one sample is free of outliers")
+    first_confidence: float = Field(0.9, gt=0, lt=1, description="the same for a first, quick attempt")
     iterations: int = Field(2000, ge=1, le=1_000_000, description="most samples drawn")
     gate_sigma: float = Field(4.3, gt=0, le=20, description="residual still an inlier, sigmas (1e-4 of a 2-D normal)")
     widen: float = Field(
@@ -88,7 +89,9 @@ class RansacFilter:
     def __init__(self, options: RansacOptions | None = None) -> None:
         self.options = options or RansacOptions()
 
-    def filter(self, points_km: FloatArray, xy: FloatArray, sigma: FloatArray) -> Consensus:
+    def filter(
+        self, points_km: FloatArray, xy: FloatArray, sigma: FloatArray, confidence: float | None = None
+    ) -> Consensus:
         """Largest set of matches that one pose explains.
 
         Parameters
@@ -99,6 +102,8 @@ class RansacFilter:
             (n, 2) on the ideal plane.
         sigma
             (n,) 1 sigma there.
+        confidence
+            That one sample is free of outliers; that of the options by default.
 
         Returns
         -------
@@ -121,7 +126,7 @@ class RansacFilter:
         gate = o.gate_sigma * o.widen * float(np.percentile(sigma, 90))
         found, turn, shift, index = cv2.solvePnPRansac(
             (points_km - centre) / scale, xy, np.eye(3), None, iterationsCount=o.iterations, reprojectionError=gate,
-            confidence=o.confidence, flags=cv2.SOLVEPNP_AP3P,
+            confidence=confidence or o.confidence, flags=cv2.SOLVEPNP_AP3P,
         )  # fmt: skip
         count = 0 if index is None else len(index)
         if not found or count < min(o.min_inliers, _KERNEL_POINTS + 1) or not np.isfinite(shift).all():
