@@ -18,6 +18,7 @@ from catalogs.header import state_from_header
 from catalogs.images import read_image
 from pipeline.geometry.rotations import quaternion_from_matrix
 from pipeline.records import FloatArray, State
+from pipeline.tables import SCHEMAS
 from workflows.cli import main
 from workflows.config import load_configuration
 
@@ -103,7 +104,7 @@ def answers(run: Path) -> dict[str, bytes]:
     """Bytes of everything that must not depend on how a run went: documents, and all tables but the timings."""
     files = [path for path in run.rglob("*") if path.is_file()]
     names = {path.relative_to(run).as_posix(): path for path in files}
-    kept = ("images/", "offsets/", "techniques/", "features/")
+    kept = ("images/", *(f"{table}/" for table in SCHEMAS if table != "timings"))
     return {name: path.read_bytes() for name, path in sorted(names.items()) if name.startswith(kept)}
 
 
