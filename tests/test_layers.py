@@ -36,8 +36,8 @@ FOUNDATIONS = {
     "predict": ("body_view", "bodies", "maplets"),
     "techniques": (
         "base", "star_fit", "star_match", "star_search", "star_inventory", "body_base", "body_search", "model_errors",
-        "template_fit", "body_minor", "contour_fit", "lm", "line_search", "relief", "ring_units", "ring_solve",
-        "ring_fit", "ring_search", "ring_answer",
+        "template_fit", "body_minor", "contour_fit", "limb_albedo", "lm", "line_search", "relief",
+        "ring_units", "ring_solve", "ring_fit", "ring_search", "ring_answer",
         "maplet_correlation", "maplet_alignment", "landmark_table", "landmark_state",
     ),
 }  # fmt: skip

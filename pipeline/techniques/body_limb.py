@@ -1,6 +1,6 @@
 """BodyLimbNav and BodyTerminatorNav: pointing from the lines that lit bodies draw."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from pydantic import Field
@@ -34,6 +34,7 @@ from pipeline.techniques.body_base import (
     turn_lever,
 )
 from pipeline.techniques.contour_fit import BandOptions, Segments, measure_segments
+from pipeline.techniques.limb_albedo import LimbEdge, limb_albedo
 from pipeline.techniques.line_search import LinePlace, search_line
 from pipeline.techniques.lm import lm_subpixel_refine
 from pipeline.techniques.model_errors import ModelErrorOptions, assumed_errors, haze_px
@@ -333,7 +334,25 @@ def _segments(
     if not levels.scale > 0:
         return "the image is not bright where the body is"
     errors = fix.errors if fix is not None else assumed_errors(cutout.primary, error_options)
-    return measure_segments(cutout, outline, frame, levels, errors, band)
+    segments = measure_segments(cutout, outline, frame, levels, errors, band)
+    if isinstance(segments, str) or not at_limb:
+        return segments
+    lags, covariance = limb_albedo(errors, _limb_edge(cutout, segments, frame, levels, band))
+    return replace(segments, texture_lags_px=lags, texture_px2=covariance)
+
+
+def _limb_edge(cutout: Cutout, segments: Segments, frame: Frame, levels: Levels, band: BandOptions) -> LimbEdge:
+    """The typical piece of a limb; on the line itself the blur leaves half of the light."""
+    template, window = cutout.template, cutout.window
+    at = np.clip(np.rint(segments.place_vu - [window.v0, window.u0]).astype(int), 0, np.array(template.image.shape) - 1)
+    lit = 2.0 * levels.scale * float(np.median(template.image[at[:, 0], at[:, 1]]))
+    bright, dark = frame.noise.variance(np.array([levels.sky + lit, levels.sky]))
+    length = float(np.median(np.hypot(*np.diff(segments.place_vu, axis=0).T)))
+    return LimbEdge(
+        radius_px=cutout.primary.diameter_px / 2, sigma_px=cutout.sigma_px,
+        half_width_px=band.half_width_px + 2.0 * cutout.sigma_px, segment_px=max(band.segment_px, length),
+        sky_weight=float(bright / max(dark, 1e-30)),
+    )  # fmt: skip
 
 
 def _step(

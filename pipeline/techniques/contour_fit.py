@@ -26,6 +26,8 @@ _FEWEST_PIXELS = 6
 _LEAST_MEASURED = 0.8
 # Variance of a place inside a pixel.
 _PIXEL_VARIANCE = 1.0 / 12.0
+# Distances over their reach at which an exponential covariance is tabulated.
+_LAGS = np.concatenate([np.linspace(0.0, 6.0, 49), [40.0]])
 
 
 class BandOptions(Options):
@@ -55,12 +57,11 @@ class Segments(Record):
         (m,) along the normal, and its 1 sigma from the pixels' noise.
     strength
         (m,) brightness relative to the template's, over its sigma.
-    texture_px
-        1 sigma of the shift that unknown albedo makes: a gradient of brightness across a blurred edge moves it.
-    texture_reach_px
-        Distance over which that is alike.
     ok
         (m,) False where nothing could be measured.
+    texture_lags_px, texture_px2
+        (k,) distances between pieces, and covariance there of the shifts that unknown albedo makes: a gradient of
+        brightness across a blurred edge moves it.
     """
 
     place_vu: FloatArray
@@ -71,14 +72,14 @@ class Segments(Record):
     sigma_px: FloatArray
     strength: FloatArray
     ok: BoolArray
-    texture_px: float
-    texture_reach_px: float
+    texture_lags_px: FloatArray
+    texture_px2: FloatArray
 
     def __post_init__(self) -> None:
         m = len(self.place_vu)
         self._freeze(
             place_vu=(m, 2), normal_vu=(m, 2), direction=(m, 3), body=(m,), shift_px=(m,), sigma_px=(m,),
-            strength=(m,), ok=(m,),
+            strength=(m,), ok=(m,), texture_lags_px=(None,), texture_px2=(len(self.texture_lags_px),),
         )  # fmt: skip
 
     def __len__(self) -> int:
@@ -89,7 +90,7 @@ class Segments(Record):
         return Segments(
             self.place_vu[index], self.normal_vu[index], self.direction[index], self.body[index],
             self.shift_px[index], self.sigma_px[index], self.strength[index], self.ok[index],
-            self.texture_px, self.texture_reach_px,
+            self.texture_lags_px, self.texture_px2,
         )  # fmt: skip
 
 
@@ -155,9 +156,9 @@ def measure_segments(
     shift = values[:, 0]
     ok = dense & whole & np.isfinite(shift) & np.isfinite(sigma) & (np.abs(shift) <= options.largest_shift_px)
     ok &= sigma <= options.largest_shift_px
-    texture = _albedo_shift(errors, cutout)
-    reach = max(errors.texture_px, 1.0)
-    segments = Segments(place, normal, direction, body, np.nan_to_num(shift), sigma, strength, ok, texture, reach)
+    lags = max(errors.texture_px, 1.0) * _LAGS
+    texture = _albedo_shift(errors, cutout) ** 2 * np.exp(-_LAGS)
+    segments = Segments(place, normal, direction, body, np.nan_to_num(shift), sigma, strength, ok, lags, texture)
     return segments if np.count_nonzero(ok) >= _FEWEST_SEGMENTS else "too few pieces of the outline show an edge"
 
 

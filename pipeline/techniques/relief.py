@@ -170,7 +170,7 @@ def _albedo(segments: Segments) -> FloatArray:
     """Covariance of the shifts that unknown albedo makes."""
     gap = segments.place_vu[:, None, :] - segments.place_vu[None, :, :]
     distance = np.hypot(gap[..., 0], gap[..., 1])
-    return np.asarray(segments.texture_px**2 * np.exp(-distance / segments.texture_reach_px))
+    return np.asarray(np.interp(distance, segments.texture_lags_px, segments.texture_px2))
 
 
 def _common(segments: Segments, common: dict[int, float]) -> FloatArray:

@@ -26,6 +26,8 @@ SHAPE = (112, 120)
 MARGIN = (12.0, 16.0)
 # What the navigator assumes of a surface that it knows nothing of, and a relief that the catalogue tells.
 ROUGH = Roughness(0.07, 0.15, 0.05, 0.6, 4e-3, float(np.radians(5.0)))
+# The same albedo on a body as round as a moon that has settled: nothing but albedo moves its limb.
+SMOOTH = replace(ROUGH, relief=2e-4)
 TECHNIQUES = ("BodyDiscCorrelateNav", "BodyLimbNav", "BodyTerminatorNav", "BodyBlobNav")
 
 
@@ -38,16 +40,18 @@ class _Study:
     failures: dict[str, int]
 
 
-def _outcomes(rng: np.random.Generator) -> tuple[FloatArray, NavContext, list[TechniqueResult | TechniqueFailure]]:
+def _outcomes(
+    rng: np.random.Generator, rough: Roughness = ROUGH
+) -> tuple[FloatArray, NavContext, list[TechniqueResult | TechniqueFailure]]:
     """One frame with a planted offset, and what each technique says."""
     camera = camera_of(SHAPE)
     place = (float(55.5 + rng.uniform(-4, 4)), float(59.5 + rng.uniform(-4, 4)))
     radius = float(rng.uniform(12, 30))
     body = body_at(camera, place, radius, float(rng.uniform(20, 100)), float(rng.uniform(0, 360)))
-    body = replace(body, shape_sigma_km=ROUGH.relief * float(body.radii_km[0]))
+    body = replace(body, shape_sigma_km=rough.relief * float(body.radii_km[0]))
     state = body_state((body,), camera, margin_vu=MARGIN)
     planted = rng.uniform(-1, 1, 2) * 0.7 * np.array(MARGIN)
-    pixels = noisy(rough_light(state, planted, ROUGH, rng), rng)
+    pixels = noisy(rough_light(state, planted, rough, rng), rng)
     frame = make_frame(pixels, None, state, FrameOptions())
     scene, context = predict_bodies(state, 0.8, BodyPredictionOptions()), NavContext.of(state)
     fix = find_disc(scene, frame, context, BodyDiscOptions())
@@ -61,13 +65,13 @@ def _outcomes(rng: np.random.Generator) -> tuple[FloatArray, NavContext, list[Te
 
 
 @cache
-def _study() -> _Study:
+def _study(rough: Roughness = ROUGH) -> _Study:
     rng = np.random.default_rng(5)
     pulls: dict[str, list[FloatArray]] = {name: [] for name in TECHNIQUES}
     errors: dict[str, list[FloatArray]] = {name: [] for name in TECHNIQUES}
     failures = dict.fromkeys(TECHNIQUES, 0)
     for _ in range(FRAMES):
-        planted, context, outcomes = _outcomes(rng)
+        planted, context, outcomes = _outcomes(rng, rough)
         for outcome in outcomes:
             if isinstance(outcome, TechniqueFailure):
                 failures[outcome.technique] += 1
@@ -101,3 +105,11 @@ def test_pulls(technique: str) -> None:
 @pytest.mark.parametrize(("technique", "limit_px"), list(zip(TECHNIQUES, (0.08, 0.08, 0.3, 0.2), strict=True)))
 def test_errors_are_a_fraction_of_a_pixel(technique: str, limit_px: float) -> None:
     assert float(np.median(np.abs(_study().errors_px[technique]))) < limit_px
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("rough", [ROUGH, SMOOTH], ids=["rough", "smooth"])
+def test_pulls_of_limbs_with_and_without_relief(rough: Roughness) -> None:
+    pulls = _study(rough).pulls["BodyLimbNav"]
+    assert 0.8 < float(np.sqrt((pulls**2).mean())) < 1.25
+    assert float((np.abs(pulls) <= 2.0).mean()) >= 0.9

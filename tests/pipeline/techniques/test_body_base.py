@@ -93,7 +93,7 @@ def test_relief_gives_sigmas_that_hold() -> None:
         shift = root @ rng.normal(size=90) + rng.normal(0.0, 0.05, 90) + normal @ np.array([0.4, -0.3])
         segments = Segments(
             50.0 * normal, normal, direction, np.zeros(90, np.int64), shift, np.full(90, 0.05), np.full(90, 20.0),
-            np.ones(90, bool), 0.001, 1.0,
+            np.ones(90, bool), np.array([0.0, 1.0]), np.array([1e-6, 0.0]),
         )  # fmt: skip
         fit = fit_relief(segments, None, {0: Field_(rms, reach, True, rms)}, ReliefOptions())
         sigma = np.sqrt(np.diag(np.linalg.inv(fit.information)))
