@@ -19,6 +19,7 @@ from pipeline.options import Options
 from pipeline.predict.rings import RingScene
 from pipeline.records import BoolArray, FloatArray, Image
 from pipeline.techniques.base import NavContext
+from pipeline.techniques.body_base import compose
 from pipeline.techniques.ring_fit import RingFit, fit_rings
 from pipeline.techniques.ring_solve import PIXEL_VARIANCE
 
@@ -33,6 +34,8 @@ _PLACES_ELSEWHERE = 16
 # Places nearer than this to the best one, in pixels across the edges, are the best one.
 _SAME_PX = 0.8
 _FEWEST_ROTATIONS = 11
+# Steps of a walk over all rotations about a place, at the farthest edge, and the most of them.
+_TURN_STEP_PX, _MOST_TURNS = 1.5, 81
 
 
 class RingSearchOptions(Options):
@@ -130,7 +133,36 @@ def find_rings(
             fits.append((fit, peak))
     if not fits:
         return problem
+    turned = _turned(scene, frame, variance, fits[0], context)
+    if turned is not None:
+        fits.append(turned)
     return _judged(scene, frame, variance, fits, context)
+
+
+def _turned(
+    scene: RingScene, frame: Frame, variance: Image, found: tuple[RingFit, _Peak], context: NavContext
+) -> tuple[RingFit, _Peak] | None:
+    """The best other rotation about where the rings were found: a round planet tells their place, not their turn."""
+    fit, peak = found
+    bound = context.max_rotation_rad
+    if not bound:
+        return None
+    lattice = _lattice(frame, variance)
+    arm = float(np.sqrt(((fit.units.places_vu - fit.pivot_vu) ** 2).sum(axis=-1)[fit.units.present].max()))
+    count = int(np.clip(np.ceil(2.0 * bound * arm / _TURN_STEP_PX), _FEWEST_ROTATIONS, _MOST_TURNS))
+    turns = np.linspace(-bound, bound, count)
+    poses = [
+        compose(context, fit.offset_vu, fit.rotation_rad, fit.pivot_vu, np.array([0.0, 0.0, turn - fit.rotation_rad]))
+        for turn in turns.tolist()
+    ]
+    left = np.array([_left_over(scene, lattice, offset, rotation).mean for offset, rotation in poses])
+    left[np.abs(turns - fit.rotation_rad) * arm < 2.0 * _TURN_STEP_PX] = np.inf
+    offset, rotation = poses[int(np.argmin(left))]
+    if not np.isfinite(left).any():
+        return None
+    other = fit_rings(scene, frame, variance, (offset, rotation), context, False)
+    start = _Peak((float(offset[0]), float(offset[1])), rotation, peak.correlation)
+    return None if isinstance(other, str) else (other, start)
 
 
 def _same(fit: RingFit, peak: _Peak) -> bool:
