@@ -36,8 +36,6 @@ _SETTLED_PX = 0.02
 _LIT_SHARE = 0.05
 # A blob is told from others by size alone.
 _SURE = 0.99
-# Rise of stray light over half the array, relative to the brightness.
-_STRAY_SHARE = 0.1
 
 
 class BodyBlobOptions(TechniqueOptions):
@@ -249,7 +247,7 @@ def _errors(cutout: Cutout, fix: TemplateFit | None, options: BodyBlobOptions) -
 
 
 def _covariance(cutout: Cutout, frame: Frame, moment: _Moment, errors: ModelErrors) -> FloatArray:
-    """Covariance of the shift: noise of pixels and sky, the sky's slope, and unknown albedo, slopes and relief."""
+    """Covariance of the shift: noise of pixels and sky, and unknown albedo, slopes and relief."""
     template, support, lever = cutout.template, moment.support, moment.lever
     light = moment.scale * template.image[support].astype(float)
     photon = frame.noise.variance(moment.sky + light)
@@ -260,10 +258,6 @@ def _covariance(cutout: Cutout, frame: Frame, moment: _Moment, errors: ModelErro
     pull = lever.sum(axis=0)
     covariance += sky_variance * np.outer(pull, pull)
     v, u = (index.astype(float) for index in np.nonzero(support))
-    half = max(frame.raw.shape) / 2.0
-    for place in (v, u):
-        ramp = lever.T @ ((place - place.mean()) / half) * _STRAY_SHARE * moment.scale
-        covariance += np.outer(ramp, ramp)
     slope = moment.scale * np.hypot(template.along_v, template.along_u)[support].astype(float)
     covariance += correlated_sums(lever, errors.texture * light, (v, u), errors.texture_px)
     covariance += correlated_sums(lever, errors.wide_texture * light, (v, u), errors.wide_texture_px)
