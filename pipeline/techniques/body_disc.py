@@ -37,6 +37,9 @@ class BodyDiscOptions(TechniqueOptions):
     min_correlation: float = Field(
         0.7, ge=0, lt=1, description="correlation of the fit, over what noise allows, below which it is spurious"
     )
+    largest_relief: float = Field(
+        0.03, gt=0, le=1, description="relief over the diameter above which it is not the body that was found"
+    )
     largest_drift_px: float = Field(6.0, gt=0, le=100, description="how far the fit may go from where it began")
 
 
@@ -179,7 +182,7 @@ def body_disc_nav(
         technique=NAME, offset_vu=about(context, fit.offset_vu, fit.rotation_rad, pivot),
         rotation_rad=fit.rotation_rad, information=fit.information, pivot_vu=pivot,
         confidence=fix.acquisition.confidence, at_edge=at_edge, at_edge_rotation=at_edge_rotation,
-        spurious=fit.correlation < options.min_correlation * fit.expected_correlation,
+        spurious=_is_spurious(fit, options),
         error_sources=tuple(f"body:{name}" for name in fix.scene.names), features=_inventory(fit, context),
         diagnostics={
             "correlation": fit.correlation, "search_correlation": fix.acquisition.correlation,
@@ -188,6 +191,12 @@ def body_disc_nav(
             "psf_sigma_px": fix.scene.sigma_px, "brightness_dn": fit.scale_dn, "night_dn": fit.night_dn,
         },
     )  # fmt: skip
+
+
+def _is_spurious(fit: TemplateFit, options: BodyDiscOptions) -> bool:
+    """Whether the image is unlike the rendering beyond its noise, or like it only by a surface that no body has."""
+    unlike = fit.correlation < options.min_correlation * fit.expected_correlation
+    return unlike or fit.errors.relief_px > options.largest_relief * fit.cutout.primary.diameter_px
 
 
 def _inventory(fit: TemplateFit, context: NavContext) -> FeatureTable:
