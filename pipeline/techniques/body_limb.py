@@ -176,7 +176,7 @@ def body_terminator_nav(
     band = options.band.model_copy(update=update)
     start = _Start(fix.offset_vu, fix.rotation_rad, min(confidence, _FOLLOWER), fix.correlation)
     fields = {
-        k: Field_(options.relief_share * view.diameter_px / 2, options.reach_deg, False, 0.0)
+        k: Field_(options.relief_share * view.diameter_px / 2, options.reach_deg, False, 0.0, of_shape=False)
         for k, view in enumerate(scene.views)
     }
     fit = _fit_line(scene, frame, fix, start, context, fields, band, options.relief, options.errors, at_limb=False)

@@ -58,6 +58,8 @@ class Field_(Record):
         1 sigma of a height that the whole outline shares.
     haze_px
         1 sigma of a height that a good part of the outline shares, as a haze lends it to where the Sun is high.
+    of_shape
+        Whether heights of the body's shape are meant, and not the wandering of a terminator.
     """
 
     rms_px: float
@@ -65,6 +67,7 @@ class Field_(Record):
     known: bool
     common_px: float
     haze_px: float = 0.0
+    of_shape: bool = True
 
 
 @dataclass(frozen=True, eq=False)
@@ -221,8 +224,8 @@ def _likeliest(
 
     def long_wave(f: float, g: float) -> float:
         # A long-wave error is part of what is not known of any shape on a short arc, which cannot show it, and of a
-        # shape that nobody vouches for.
-        if span_deg <= _SHORT_ARC_DEG:
+        # line that nobody vouches for.
+        if span_deg <= _SHORT_ARC_DEG and any(field.of_shape for field in fields.values()):
             return max(g, _UNKNOWN_LONG)
         return g if known else max(g, _SHOWN_LONG * f)
 
