@@ -15,6 +15,8 @@ from pipeline.techniques.base import NavContext, TechniqueOptions, edge_flags
 
 # A rotation whose own sigma is above this share of its bound's is told by the bound, not by the image.
 _ROTATION_SEEN = 1.0 / 3.0
+# Lit area in the frame over a body's own below which the direction of its light is not believed.
+_CORNER_SHARE = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,6 +39,8 @@ class Cutout:
         (rows, cols) DN.
     good
         (rows, cols) True where measured.
+    corner
+        Whether too little of each body is seen for its shading to tell the camera's rotation.
     """
 
     views: tuple[BodyView, ...]
@@ -48,6 +52,7 @@ class Cutout:
     sigma_px: float
     data: Image
     good: BoolArray
+    corner: bool
 
     @property
     def window(self) -> Window:
@@ -86,9 +91,24 @@ def cut_out(scene: BodyScene, frame: Frame, offset_vu: FloatArray, rotation_rad:
         return None
     rows, cols = template.window.slices_in(Window(0, 0, *frame.raw.shape))
     primary, pivot = scene.primary(views), scene.centroid(views)
+    corner = scene.state.settings.fit_camera_rotation and _only_corners(scene, views)
     return Cutout(
-        views, primary, pivot, template, offset, rotation, scene.sigma_px, frame.raw[rows, cols], ~frame.bad[rows, cols]
-    )
+        views, primary, pivot, template, offset, rotation, scene.sigma_px, frame.raw[rows, cols],
+        ~frame.bad[rows, cols], corner,
+    )  # fmt: skip
+
+
+def _only_corners(scene: BodyScene, views: tuple[BodyView, ...]) -> bool:
+    """Whether all bodies show so little of themselves that albedo passes for a Sun from elsewhere.
+
+    A body with a known relief tells the rotation by that.
+    """
+    if any(view.body.mesh is not None for view in views):
+        return False
+    camera = scene.state.camera_model
+    inside = [area for area, _ in scene.lit_areas(views)]
+    whole = [view.lit_area_px2(camera, view.box, ())[0] for view in views]
+    return all(part < _CORNER_SHARE * all_of_it for part, all_of_it in zip(inside, whole, strict=True))
 
 
 @dataclass(frozen=True)

@@ -332,7 +332,7 @@ def _solve(
     lever = None
     if turns:
         block = _marginal(gram + np.diag(prior), size)
-        if not rotation_shows(block, context):
+        if cutout.corner or not rotation_shows(block, context):
             # Where the image does not show the rotation, it stays.
             lever = rotation_lever(block)
             prior[2] = 1e6 * gram[2, 2] + 1e-12
