@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
-from scipy.stats import binom
+from scipy.special import bdtrc
 
 from pipeline.camera import pixel_scale_rad, project, project_jacobian
 from pipeline.frame import Frame
@@ -320,4 +320,4 @@ def _confidence(agreeing: int, table: LandmarkTable, context: NavContext) -> flo
     window_px2 = ((2 * REACH + 1) / np.median(table.ratio)) ** 2
     chance = min(1.0, np.pi * _AGREEMENT_PX**2 / window_px2)
     offsets = float(np.prod(2.0 * np.array(context.search_margin_vu) / _AGREEMENT_PX))
-    return float(1.0 - min(1.0, offsets * binom.sf(agreeing - 1, len(table), min(chance, 0.5))))
+    return float(1.0 - min(1.0, offsets * bdtrc(agreeing - 1, len(table), min(chance, 0.5))))
