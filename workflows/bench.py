@@ -10,7 +10,6 @@ import os
 import statistics
 import tempfile
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,14 +20,7 @@ from rich.table import Table
 
 from catalogs.archive import open_archive
 from pipeline.curate import Json
-from workflows.bench_scenes import (
-    make_disc_1024,
-    make_disc_turned,
-    make_lorri_256,
-    make_moons_and_stars,
-    make_ring_1024,
-    make_stars_1024,
-)
+from workflows.bench_scenes import SCENES, make_scene
 from workflows.config import load_configuration
 from workflows.plan import make_plan
 from workflows.store import RunFolder, prepare, to_json, write_atomically
@@ -49,13 +41,6 @@ class Figures:
     high_s: float
     peak_rss_mb: float
     status: str
-
-
-CASES: dict[str, Callable[[Path], Path]] = {
-    "stars_1024": make_stars_1024, "lorri_256": make_lorri_256, "disc_1024": make_disc_1024,
-    "moons_stars": make_moons_and_stars, "disc_turned": make_disc_turned,
-    "ring_1024": make_ring_1024,
-}  # fmt: skip
 
 
 def time_case(archive: Path, run_folder: Path) -> Figures:
@@ -127,8 +112,8 @@ def main() -> None:
     context = multiprocessing.get_context("spawn")
     figures: dict[str, Figures] = {}
     with tempfile.TemporaryDirectory() as scratch:
-        for name, make in CASES.items():
-            archive = make(Path(scratch) / name)
+        for name in SCENES:
+            archive = make_scene(name, Path(scratch) / name)
             with context.Pool(1) as pool:
                 figures[name] = pool.apply(time_case, (archive, Path(scratch) / f"{name}-run"))
     floor = floor_seconds()

@@ -1,6 +1,7 @@
 """Scenes of the benchmark: stars, and lit spheres drawn by a few lines of their own."""
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -21,11 +22,13 @@ _RING_SINE = 0.5
 _RING_PLANE_WXYZ = [0.6830127018922193, 0.1830127018922193, 0.1830127018922193, -0.6830127018922193]
 
 
-def make_stars_1024(folder: Path) -> Path:
-    """Archive of one 1024 x 1024 frame with 40 catalogue stars and 300 detections, rotation searched too.
+def make_scene(name: str, folder: Path) -> Path:
+    """Archive of one scene.
 
     Parameters
     ----------
+    name
+        Of :data:`SCENES`.
     folder
         New folder.
 
@@ -34,6 +37,11 @@ def make_stars_1024(folder: Path) -> Path:
     pathlib.Path
         Its archive.yaml.
     """
+    return SCENES[name](folder)
+
+
+def _stars_1024(folder: Path) -> Path:
+    """Archive of one 1024 x 1024 frame with 40 catalogue stars and 300 detections, rotation searched too."""
     rng = np.random.default_rng(4)
     catalogue = rng.uniform(20.0, 1003.0, (40, 2))
     flux = np.concatenate([10.0 ** rng.uniform(2.9, 4.5, 40), 10.0 ** rng.uniform(2.5, 4.2, 270)])
@@ -41,70 +49,26 @@ def make_stars_1024(folder: Path) -> Path:
     return _write(folder, "stars_1024", _stars(places, flux), (catalogue, flux[:40]), [], turns=True)
 
 
-def make_lorri_256(folder: Path) -> Path:
-    """Archive of LORRI-like 4x4-binned frames with 5 to 40 catalogue stars.
-
-    Parameters
-    ----------
-    folder
-        New folder.
-
-    Returns
-    -------
-    pathlib.Path
-        Its archive.yaml.
-    """
+def _lorri_256(folder: Path) -> Path:
+    """Archive of LORRI-like 4x4-binned frames with 5 to 40 catalogue stars."""
     options = StarSampleOptions(frames=8, seed=11, cameras=("lorri_4x4",), min_stars=5, max_stars=40, processes=1)
     return make_star_sample(folder, options)
 
 
-def make_disc_1024(folder: Path) -> Path:
-    """Archive of one 1024 x 1024 frame with a disc of 400 pixels, margins 50 x 140.
-
-    Parameters
-    ----------
-    folder
-        New folder.
-
-    Returns
-    -------
-    pathlib.Path
-        Its archive.yaml.
-    """
+def _disc_1024(folder: Path) -> Path:
+    """Archive of one 1024 x 1024 frame with a disc of 400 pixels, margins 50 x 140."""
     discs = [(np.array([520.0, 480.0]), 200.0, "ALPHA")]
     return _write(folder, "disc_1024", _spheres(discs), None, discs, turns=False)
 
 
-def make_disc_turned(folder: Path) -> Path:
-    """The same with a small moon beside the disc and a rotation of up to five degrees to be searched.
-
-    Parameters
-    ----------
-    folder
-        New folder.
-
-    Returns
-    -------
-    pathlib.Path
-        Its archive.yaml.
-    """
+def _disc_turned(folder: Path) -> Path:
+    """Archive of the disc with a small moon beside the disc and a rotation of up to five degrees to be searched."""
     discs = [(np.array([520.0, 480.0]), 200.0, "ALPHA"), (np.array([230.0, 800.0]), 60.0, "BETA")]
     return _write(folder, "disc_turned", _spheres(discs), None, discs, turns=True)
 
 
-def make_moons_and_stars(folder: Path) -> Path:
-    """Archive of one 1024 x 1024 frame with two moons and twenty catalogue stars.
-
-    Parameters
-    ----------
-    folder
-        New folder.
-
-    Returns
-    -------
-    pathlib.Path
-        Its archive.yaml.
-    """
+def _moons_and_stars(folder: Path) -> Path:
+    """Archive of one 1024 x 1024 frame with two moons and twenty catalogue stars."""
     rng = np.random.default_rng(5)
     discs = [(np.array([620.0, 420.0]), 110.0, "ALPHA"), (np.array([300.0, 760.0]), 60.0, "BETA")]
     catalogue = rng.uniform(100.0, 920.0, (60, 2))
@@ -115,19 +79,8 @@ def make_moons_and_stars(folder: Path) -> Path:
     return _write(folder, "moons_stars", light, (catalogue, flux), discs, turns=False)
 
 
-def make_ring_1024(folder: Path) -> Path:
-    """Archive of one 1024 x 1024 frame with an inclined eccentric ringlet, margins 50 x 140.
-
-    Parameters
-    ----------
-    folder
-        New folder.
-
-    Returns
-    -------
-    pathlib.Path
-        Its archive.yaml.
-    """
+def _ring_1024(folder: Path) -> Path:
+    """Archive of one 1024 x 1024 frame with an inclined eccentric ringlet, margins 50 x 140."""
     rings: dict[str, object] = {
         "planet": "ALPHA", "position_km": [_RANGE_KM, 0.0, 0.0],
         "plane_from_j2000_wxyz": _RING_PLANE_WXYZ, "opening_sun_deg": 40.0,
@@ -236,3 +189,10 @@ def _sidecar(name: str, turns: bool) -> dict[str, object]:
         "gain_e_per_dn": 12.0, "fit_camera_rotation": turns, "max_rotation_deg": 5.0,
         "search_margin_vu": [50.0, 140.0], "attitude": {"camera_from_j2000_wxyz": [0.5, -0.5, -0.5, -0.5]},
     }  # fmt: skip
+
+
+SCENES: dict[str, Callable[[Path], Path]] = {
+    "stars_1024": _stars_1024, "lorri_256": _lorri_256, "disc_1024": _disc_1024, "moons_stars": _moons_and_stars,
+    "disc_turned": _disc_turned, "ring_1024": _ring_1024,
+}  # fmt: skip
+"""Scenes by name."""
