@@ -21,6 +21,10 @@ _IDENTITY = (
 )
 _PIXEL = "px"
 
+# Raised when a column changes its name or meaning; one more column needs no new version, older tables have it null.
+SCHEMA_VERSION = 1
+VERSION_KEY = b"pilotage_tables"
+
 SCHEMAS: dict[str, pa.Schema] = {
     "offsets": pa.schema([
         *_IDENTITY,

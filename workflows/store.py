@@ -16,7 +16,15 @@ import pyarrow.parquet as pq
 
 from pipeline.curate import Json
 from pipeline.errors import ConfigurationError
-from pipeline.tables import SCHEMAS, block_columns, feature_columns, offset_row, technique_rows
+from pipeline.tables import (
+    SCHEMA_VERSION,
+    SCHEMAS,
+    VERSION_KEY,
+    block_columns,
+    feature_columns,
+    offset_row,
+    technique_rows,
+)
 
 # Images whose rows are written together: bounds memory and fixes the row groups whatever the worker count.
 _IMAGES_PER_GROUP = 2000
@@ -228,7 +236,8 @@ def _partition(mission: str, camera: str) -> str:
 def _write_partition(folder: RunFolder, table: str, mission: str, camera: str, image_ids: Sequence[str]) -> None:
     """One Parquet file; mission and camera live in its path, as hive partitions do."""
     names = [name for name in SCHEMAS[table].names if name not in ("mission", "camera")]
-    schema = pa.schema([SCHEMAS[table].field(name) for name in names])
+    version = {VERSION_KEY: str(SCHEMA_VERSION).encode()}
+    schema = pa.schema([SCHEMAS[table].field(name) for name in names], metadata=version)
     target = folder.root / table / _partition(mission, camera) / f"{table}.parquet"
     target.parent.mkdir(parents=True, exist_ok=True)
     temporary = target.with_name(f".{target.name}.{uuid4().hex}")
