@@ -19,7 +19,7 @@ from catalogs.archive import Archive, open_archive
 from catalogs.images import read_image
 from pipeline.curate import Json
 from pipeline.errors import ConfigurationError, PilotageError
-from workflows import catalog_cli, pose_cli, query_cli, sample_cli
+from workflows import catalog_cli, pose_cli, query_cli, sample_cli, status_cli
 from workflows.ck import FOLDER, write_c_kernels
 from workflows.config import Configuration, load_configuration, parse_setting
 from workflows.execute import ClusterOptions
@@ -30,7 +30,6 @@ from workflows.report import (
     print_comparison,
     print_counts,
     print_image,
-    progress_of,
     read_truth,
 )
 from workflows.run import EXIT_INTERRUPTED, EXIT_NOT_STARTED, RunListener, execute, exit_code
@@ -45,6 +44,7 @@ app.add_typer(sample_cli.app, name="sample")
 app.add_typer(catalog_cli.app, name="catalog")
 app.command()(pose_cli.pose)
 app.command()(query_cli.query)
+app.command()(status_cli.status)
 
 _LOG = logging.getLogger("pilotage")
 _ARCHIVE_KEY = "archive."
@@ -193,15 +193,6 @@ def _follow(console: Console, work: Plan):  # type: ignore[no-untyped-def]
             console.print(f"{done}/{total}  {line()}  {left:.0f} s left", highlight=False, soft_wrap=True)
 
     yield RunListener(lambda text: console.print(text, highlight=False, soft_wrap=True), log_done, start)
-
-
-@app.command()
-def status(run_folder: RunArg) -> None:
-    """Say how far a run is, from its files alone."""
-    planned, statuses, finished = progress_of(RunFolder(run_folder))
-    done = sum(statuses.values())
-    counts = ", ".join(f"{count} {name}" for name, count in sorted(statuses.items())) or "none yet"
-    typer.echo(f"{done} of {planned} images done ({counts}); {'finished' if finished else 'not finished'}")
 
 
 @app.command()

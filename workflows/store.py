@@ -4,10 +4,12 @@ import fcntl
 import json
 import os
 import re
+import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TextIO
 from urllib.parse import quote
 from uuid import uuid4
 
@@ -29,6 +31,8 @@ from pipeline.tables import (
 # Images whose rows are written together: bounds memory and fixes the row groups whatever the worker count.
 _IMAGES_PER_GROUP = 2000
 _LOCK = ".lock"
+# Looking at a lock holds it for microseconds.
+_GLANCE_S = 0.05
 _TEMPORARY = re.compile(r"^\.[^/]+\.[0-9a-f]{32}$")
 
 
@@ -52,6 +56,11 @@ class RunFolder:
     def plan(self) -> Path:
         """Ids of the images of the latest run."""
         return self.root / "plan.json"
+
+    @property
+    def lock(self) -> Path:
+        """Held by the process at work."""
+        return self.root / _LOCK
 
     def document(self, image_id: str) -> Path:
         """Document of an image."""
@@ -129,16 +138,25 @@ def exclusive(folder: RunFolder) -> Iterator[None]:
     refuse_foreign(folder)
     try:
         folder.root.mkdir(parents=True, exist_ok=True)
-        lock = (folder.root / _LOCK).open("w")
+        lock = folder.lock.open("w")
     except OSError as error:
         raise ConfigurationError(f"cannot write {folder.root}: {error.strerror}") from error
     with lock:
         try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            _take(lock)
         except BlockingIOError as error:
             raise ConfigurationError(f"another run is at work in {folder.root}") from error
         prepare(folder)
         yield
+
+
+def _take(lock: TextIO) -> None:
+    """Lock a file for this process, at the second try where somebody has just looked whether it is locked."""
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        time.sleep(_GLANCE_S)
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
 
 def sweep(folder: RunFolder) -> None:

@@ -1,0 +1,112 @@
+"""How far a run is, from its files alone: for a terminal beside it, or the morning after."""
+
+import fcntl
+from collections import Counter
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from enum import StrEnum
+
+from workflows.report import progress_of
+from workflows.store import RunFolder
+
+
+class RunState(StrEnum):
+    """What a run is at."""
+
+    RUNNING = "running"
+    FINISHED = "finished"
+    STOPPED = "killed or interrupted"
+
+
+@dataclass(frozen=True)
+class RunStatus:
+    """A run at one moment.
+
+    Attributes
+    ----------
+    state
+        Running, finished, or stopped before its end.
+    planned
+        Images of the latest run.
+    statuses
+        Images answered by status, those of earlier runs included.
+    answered_now
+        Images answered since the latest start.
+    seconds
+        From that start to the latest answer.
+    last_outcome
+        When the latest answer came; None if none has come since the start.
+    """
+
+    state: RunState
+    planned: int
+    statuses: Counter[str]
+    answered_now: int
+    seconds: float
+    last_outcome: datetime | None
+
+    @property
+    def left(self) -> int:
+        """Images without an answer."""
+        return self.planned - sum(self.statuses.values())
+
+    @property
+    def rate_per_s(self) -> float | None:
+        """Images per second since the latest start; None before the first."""
+        return self.answered_now / self.seconds if self.answered_now and self.seconds > 0 else None
+
+    def line(self) -> str:
+        """One line for a person."""
+        counts = ", ".join(f"{count} {name}" for name, count in sorted(self.statuses.items())) or "none yet"
+        parts = [f"{self.planned - self.left} of {self.planned} images done ({counts})"]
+        if self.last_outcome is not None:
+            parts.append(f"last outcome {self.last_outcome.isoformat(timespec='seconds')}")
+        parts.append("finished" if self.state is RunState.FINISHED else f"not finished: {self.state}")
+        rate = self.rate_per_s
+        if self.state is RunState.RUNNING and rate is not None:
+            parts.append(f"{rate:.1f} images/s, {self.left / rate:.0f} s left")
+        if self.state is RunState.STOPPED:
+            parts.append("run the same command again to go on")
+        return "; ".join(parts)
+
+
+def status_of_run(folder: RunFolder) -> RunStatus:
+    """State of a run, perhaps at work in another process or on another machine.
+
+    Parameters
+    ----------
+    folder
+        The run; nothing is written.
+
+    Returns
+    -------
+    RunStatus
+        As of now.
+
+    Raises
+    ------
+    ConfigurationError
+        If the folder holds no run.
+    """
+    # The lock first: a run that ends meanwhile then counts as finished, never as killed.
+    at_work = _is_locked(folder)
+    planned, statuses, finished = progress_of(folder)
+    state = RunState.FINISHED if finished else RunState.RUNNING if at_work else RunState.STOPPED
+    started = folder.plan.stat().st_mtime
+    times = [entry.stat().st_mtime for entry in folder.state.glob("[!.]*.json")]
+    now = [time for time in times if time >= started]
+    last = max(now, default=started)
+    outcome = datetime.fromtimestamp(last, UTC) if now else None
+    return RunStatus(state, planned, statuses, len(now), last - started, outcome)
+
+
+def _is_locked(folder: RunFolder) -> bool:
+    """Whether a process holds a run's lock, which the system takes from the dead."""
+    try:
+        with folder.lock.open("rb") as lock:
+            fcntl.flock(lock, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    except (FileNotFoundError, NotADirectoryError):
+        return False
+    return False
