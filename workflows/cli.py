@@ -19,7 +19,7 @@ from catalogs.archive import Archive, open_archive
 from catalogs.images import read_image
 from pipeline.curate import Json
 from pipeline.errors import ConfigurationError, PilotageError
-from workflows import catalog_cli, pose_cli, query_cli, sample_cli, status_cli
+from workflows import catalog_cli, doctor_cli, pose_cli, query_cli, sample_cli, status_cli
 from workflows.ck import FOLDER, write_c_kernels
 from workflows.config import Configuration, load_configuration, parse_setting
 from workflows.execute import ClusterOptions
@@ -44,6 +44,7 @@ app.add_typer(sample_cli.app, name="sample")
 app.add_typer(catalog_cli.app, name="catalog")
 app.command()(pose_cli.pose)
 app.command()(query_cli.query)
+app.command()(doctor_cli.doctor)
 app.command()(status_cli.status)
 
 _LOG = logging.getLogger("pilotage")
