@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-import duckdb
 import numpy as np
 import pandas as pd
 from rich.console import Console
@@ -19,6 +18,7 @@ from rich.text import Text
 from pipeline.curate import Json
 from pipeline.errors import ConfigurationError
 from workflows.store import RunFolder, read_json
+from workflows.tables_reader import open_tables
 
 _PLANTED = ["offset_dv_px", "offset_du_px", "rotation_deg"]
 
@@ -67,12 +67,10 @@ def offsets(folder: RunFolder) -> pd.DataFrame:
     ConfigurationError
         If there is no such table.
     """
-    files = sorted((folder.root / "offsets").rglob("*.parquet"))
-    if not files:
+    table = open_tables(folder).get("offsets")
+    if table is None:
         raise ConfigurationError(f"{folder.root} holds no finished run: it has no table offsets")
-    with duckdb.connect() as database:
-        relation = database.read_parquet([str(path) for path in files], hive_partitioning=True)
-        return pd.DataFrame(relation.order("image_id").df())
+    return pd.DataFrame(table.to_table().sort_by("image_id").to_pandas())
 
 
 def read_truth(path: Path) -> dict[str, dict[str, float]]:
