@@ -19,7 +19,7 @@ from catalogs.archive import Archive, open_archive
 from catalogs.images import read_image
 from pipeline.curate import Json
 from pipeline.errors import ConfigurationError, PilotageError
-from workflows import catalog_cli, doctor_cli, pose_cli, query_cli, sample_cli, status_cli
+from workflows import catalog_cli, doctor_cli, pose_cli, query_cli, report_cli, sample_cli, status_cli
 from workflows.ck import FOLDER, write_c_kernels
 from workflows.config import Configuration, load_configuration, parse_setting
 from workflows.execute import ClusterOptions
@@ -43,6 +43,7 @@ app = typer.Typer(
 app.add_typer(sample_cli.app, name="sample")
 app.add_typer(catalog_cli.app, name="catalog")
 app.command()(pose_cli.pose)
+app.command()(report_cli.report)
 app.command()(query_cli.query)
 app.command()(doctor_cli.doctor)
 app.command()(status_cli.status)

@@ -1,0 +1,273 @@
+"""The page itself: figures, tables and words of one run in a file that needs no network."""
+
+import base64
+import html
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pandas as pd
+import plotly.graph_objects as go
+import plotly.io as pio
+from plotly.offline import get_plotlyjs
+
+from pipeline.curate import Json
+from workflows.html_report.figures import bars, histogram, scatter
+from workflows.html_report.rows import Change, RunRows, strangest
+from workflows.html_report.style import SCRIPT, STYLE
+
+_THUMBNAIL_PX = 720
+_MOST_LISTED, _MOST_EMBEDDED = 40, 36
+MOST_PULL, MOST_STRANGENESS = 4.0, 10.0
+"""Sigmas from which two techniques are said to disagree, and an answer to be unlike its camera's others."""
+
+
+@dataclass(frozen=True)
+class Pictures:
+    """Summary pictures that a run has.
+
+    Attributes
+    ----------
+    folder
+        PNG files named by image id; need not exist.
+    """
+
+    folder: Path
+
+    def embedded(self, image_ids: Sequence[str]) -> dict[str, str]:
+        """Data URIs of those that exist, shrunk."""
+        found = {}
+        for image_id in dict.fromkeys(image_ids):
+            path = self.folder / f"{image_id}.png"
+            picture = cv2.imread(str(path)) if path.is_file() else None
+            if picture is None:
+                continue
+            factor = min(1.0, _THUMBNAIL_PX / max(picture.shape))
+            small = cv2.resize(picture, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
+            data = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, 80])[1].tobytes()
+            found[image_id] = "data:image/jpeg;base64," + base64.b64encode(data).decode()
+        return found
+
+
+def render(
+    title: str, rows: RunRows, provenance: dict[str, Json], pictures: Pictures, change: Change | None = None
+) -> str:
+    """Write the report.
+
+    Parameters
+    ----------
+    title
+        Name of the run.
+    rows
+        Its tables.
+    provenance
+        Of ``run.json``: versions, configuration digest, kernels, catalogues.
+    pictures
+        Its summary pictures.
+    change
+        Against another run.
+
+    Returns
+    -------
+    str
+        HTML; the same tables give the same text.
+    """
+    strange = strangest(rows.answers)
+    parts = [_headline(title, rows, strange)]
+    if change is not None:
+        parts.append(_changes(change))
+    parts += [_outcomes(rows), _offsets(rows), _agreement(rows), _speed(rows), _strange(strange), _failures(rows)]
+    parts.append(_provenance(provenance))
+    first_failures = [image_id for ids in rows.failed["first_ids"] for image_id in ids[:3]]
+    worst = _worst_pairs(rows)["image_id"]
+    wanted = [*strange["image_id"], *first_failures, *worst, *rows.slowest["image_id"]]
+    shown = {"pictures": pictures.embedded(wanted[:_MOST_EMBEDDED])}
+    # A closing tag inside a script would end it.
+    data = json.dumps(shown, sort_keys=True).replace("</", "<\\/")
+    body = "\n".join(parts)
+    return (
+        f'<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"><title>{html.escape(title)} - Pilotage</title>\n'
+        f'<meta name="viewport" content="width=device-width, initial-scale=1"><style>{STYLE}</style>\n'
+        f"<script>{get_plotlyjs()}</script></head>\n<body><main>\n{body}\n</main>\n"
+        '<dialog id="picture" aria-labelledby="picture-title"><h2 id="picture-title"></h2><div id="picture-body"></div>'
+        '<form method="dialog"><button>Close</button></form></dialog>\n'
+        f'<script id="data" type="application/json">{data}</script><script>{SCRIPT}</script></body></html>\n'
+    )
+
+
+def _section(name: str, *content: str) -> str:
+    anchor = name.lower().replace(" ", "-")
+    return f'<section aria-labelledby="{anchor}"><h2 id="{anchor}">{html.escape(name)}</h2>\n' + "\n".join(content) + (
+        "\n</section>"
+    )
+
+
+def _figure(figure: go.Figure, name: str, said: str) -> str:
+    """One figure with its caption, which is its text alternative too."""
+    drawn = pio.to_html(
+        figure, full_html=False, include_plotlyjs=False, div_id=f"plot-{name}",
+        config={"displaylogo": False, "responsive": True},
+    )  # fmt: skip
+    return (
+        f'<figure role="group" aria-label="{html.escape(said, quote=True)}">{drawn}'
+        f"<figcaption>{html.escape(said)}</figcaption></figure>"
+    )
+
+
+def _button(image_id: str) -> str:
+    escaped = html.escape(image_id, quote=True)
+    return f'<button class="image" data-image="{escaped}">{escaped}</button>'
+
+
+def _table(rows: pd.DataFrame, caption: str) -> str:
+    """Rows as a table; image ids become buttons."""
+    head = "".join(f'<th scope="col">{html.escape(str(name).replace("_", " "))}</th>' for name in rows.columns)
+    lines = []
+    for record in rows.itertuples(index=False):
+        cells = [
+            f"<td>{_button(str(value))}</td>" if name == "image_id" else f"<td>{_cell(value)}</td>"
+            for name, value in zip(rows.columns, record, strict=True)
+        ]
+        lines.append("<tr>" + "".join(cells) + "</tr>")
+    return (
+        f'<div class="wide" tabindex="0" role="region" aria-label="{html.escape(caption, quote=True)}"><table><caption>'
+        f"{html.escape(caption)}</caption><thead><tr>{head}</tr></thead><tbody>{''.join(lines)}</tbody></table></div>"
+    )
+
+
+def _cell(value: object) -> str:
+    if isinstance(value, (list, np.ndarray)):
+        return " ".join(_button(str(item)) for item in value)
+    if value is None or value != value:
+        return ""
+    return f"{value:.4g}" if isinstance(value, float) else html.escape(str(value))
+
+
+def _headline(title: str, rows: RunRows, strange: pd.DataFrame) -> str:
+    answers = rows.answers
+    count, solved = len(answers), int((answers["status"] == "success").sum())
+    tiles = "".join(
+        f'<div class="tile {status}"><strong>{number}</strong> {status}</div>'
+        for status in ("success", "failed", "conflicted", "error")
+        for number in [int((answers["status"] == status).sum())]
+    )
+    look = [f"{n} ended as {reason.replace('_', ' ')}" for reason, n in
+            zip(rows.failed["reason"], rows.failed["images"], strict=True)][:3]  # fmt: skip
+    odd = int((strange["strangeness"] > MOST_STRANGENESS).sum())
+    if odd:
+        more = " or more" if odd == len(strange) else ""
+        look.append(f"{odd}{more} lie more than {MOST_STRANGENESS:g} sigmas from their camera's others")
+    doubt = int((rows.pairs["pull"] > MOST_PULL).sum())
+    if doubt:
+        look.append(f"{doubt} pairs of techniques differ by more than {MOST_PULL:g} sigmas")
+    share = 100.0 * solved / count if count else 0.0
+    text = f"<p class='lead'>{solved} of {count} images navigated ({share:.1f} %).</p>"
+    listed = "".join(f"<li>{html.escape(item)}</li>" for item in look) or "<li>Nothing stands out.</li>"
+    head = f"<h1>{html.escape(title)}</h1>{text}<div class='tiles'>{tiles}</div>"
+    return f"<header>{head}<h2>Look at</h2><ul>{listed}</ul></header>"
+
+
+def _outcomes(rows: RunRows) -> str:
+    counts = rows.answers.groupby(["status", "status_reason"], observed=True).size().sort_values(ascending=False)
+    names = [f"{status}: {reason.replace('_', ' ')}" for status, reason in counts.index]
+    figure = bars(names, counts.to_list(), ("images", ""))
+    return _section("Outcomes", _figure(figure, "outcomes", "Images by outcome and its reason."))
+
+
+def _offsets(rows: RunRows) -> str:
+    solved = rows.answers.dropna(subset=["offset_dv_px"])
+    sigmas = {
+        str(camera): group["sigma_px"].to_numpy(float)[group["sigma_px"].to_numpy(float) > 0]
+        for camera, group in solved.groupby("camera", observed=True)
+    }
+    parts = [
+        _figure(scatter(solved, "time_utc", "offset_dv_px", ("time (UTC)", "dv, px")), "dv-time",
+                "Offset along rows against time."),
+        _figure(scatter(solved, "time_utc", "offset_du_px", ("time (UTC)", "du, px")), "du-time",
+                "Offset along columns against time."),
+        _figure(scatter(solved, "offset_du_px", "offset_dv_px", ("du, px", "dv, px")), "field",
+                "Offsets of both axes: a camera's boresight error is a common shift."),
+        _figure(histogram(sigmas, ("sigma, px", "images")), "sigmas", "One sigma of the offset, by camera."),
+        _figure(scatter(solved, "rank", "sigma_px", ("rank", "sigma, px"), log_y=True), "rank",
+                "Sigma against rank."),
+    ]  # fmt: skip
+    turned = solved.dropna(subset=["rotation_deg"])
+    if len(turned):
+        parts.append(
+            _figure(scatter(turned, "time_utc", "rotation_deg", ("time (UTC)", "rotation, deg")), "rotation",
+                    "Rotation against time, where it was fitted and seen.")
+        )  # fmt: skip
+    return _section("Offsets", '<div class="grid">', *parts, "</div>")
+
+
+def _worst_pairs(rows: RunRows) -> pd.DataFrame:
+    worst: pd.DataFrame = rows.pairs.nlargest(10, "pull", keep="first")
+    return worst[["image_id", "pair", "pull"]]
+
+
+def _agreement(rows: RunRows) -> str:
+    if not len(rows.pairs):
+        return _section("Agreement of techniques", "<p>No image has two techniques' answers that can be compared.</p>")
+    by_pair = rows.pairs.groupby("pair")["pull"]
+    summary = pd.DataFrame(
+        {"images": by_pair.size(), "median": by_pair.median(), "largest": by_pair.max()}
+    ).reset_index()  # fmt: skip
+    figure = scatter(rows.pairs.assign(order=np.arange(len(rows.pairs))), "order", "pull",
+                     ("pair of answers", "joint sigmas"), by="pair", log_y=True)  # fmt: skip
+    # Two dozen pairs would fill a narrow page with their key; hover names them.
+    figure.update_layout(showlegend=False)
+    return _section(
+        "Agreement of techniques", _figure(figure, "pulls", "Distance of two techniques' answers over its sigma."),
+        _table(summary, "Joint sigmas between techniques, worse axis"),
+        _table(_worst_pairs(rows), "Largest disagreements"),
+    )  # fmt: skip
+
+
+def _speed(rows: RunRows) -> str:
+    stages = rows.stages[rows.stages["stage"] != "total"]
+    figure = bars(stages["stage"].to_list(), stages["total_s"].to_list(), ("seconds in all", ""))
+    return _section(
+        "Seconds", _figure(figure, "stages", "Seconds of each stage, all images together."),
+        _table(rows.stages, "Seconds per image and stage"), _table(rows.slowest, "Slowest images"),
+    )  # fmt: skip
+
+
+def _strange(strange: pd.DataFrame) -> str:
+    columns = ["image_id", "camera", "offset_dv_px", "offset_du_px", "sigma_px", "rank", "strangeness"]
+    return _section("Strangest answers", _table(
+        strange[columns], "Farthest from the median of their camera, in sigmas of its scatter and their own"
+    ))  # fmt: skip
+
+
+def _failures(rows: RunRows) -> str:
+    if not len(rows.failed):
+        return _section("Without an answer", "<p>None.</p>")
+    question = "select image_id, detail from offsets where status_reason = '…'"
+    ask = f'<p>All of one reason: <code>pilotage query RUN "{question}"</code></p>'
+    return _section("Without an answer", _table(rows.failed, "By reason, with the first images of each"), ask)
+
+
+def _changes(change: Change) -> str:
+    text = (
+        f"<p>Of {change.common} images in both runs, {len(change.failed)} are newly without an answer, "
+        f"{len(change.solved)} newly solved, {len(change.moved)} moved by more than three joint sigmas.</p>"
+    )
+    parts = [text]
+    for name, ids in (("Newly without an answer", change.failed), ("Newly solved", change.solved)):
+        if ids:
+            parts.append(f"<h3>{name}</h3><p>{' '.join(_button(i) for i in ids[:_MOST_LISTED])}</p>")
+    if len(change.moved):
+        columns = ["image_id", "sigmas", "offset_dv_px_before", "offset_du_px_before", "offset_dv_px_after",
+                   "offset_du_px_after"]  # fmt: skip
+        parts.append(_table(change.moved[columns].head(_MOST_LISTED), "Moved"))
+    return _section("Changes", *parts)
+
+
+def _provenance(provenance: dict[str, Json]) -> str:
+    shown = {key: value for key, value in provenance.items() if key != "configuration"}
+    return _section(
+        "Provenance", f'<pre tabindex="0">{html.escape(json.dumps(shown, indent=1, sort_keys=True)[:60000])}</pre>'
+    )

@@ -1,0 +1,31 @@
+"""``pilotage report``."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from pipeline.errors import ConfigurationError
+from workflows.store import RunFolder, read_json, write_atomically
+
+
+def report(
+    run_folder: Annotated[Path, typer.Argument(help="Folder of a run.")],
+    output: Annotated[Path | None, typer.Option("--output", "-o", help="HTML to write; RUN/report.html.")] = None,
+    compare: Annotated[Path | None, typer.Option("--compare", help="An earlier run of the same images.")] = None,
+) -> None:
+    """Write one HTML file that says how a run went and what to look at; it needs no network."""
+    # Drawing libraries take a second to load, which no other command should pay.
+    from workflows.html_report.page import Pictures, render
+    from workflows.html_report.rows import changes, collect
+
+    folder = RunFolder(run_folder)
+    rows = collect(folder)
+    change = changes(collect(RunFolder(compare)).answers, rows.answers) if compare is not None else None
+    provenance = read_json(run_folder / "run.json")
+    if provenance is None:
+        raise ConfigurationError(f"{run_folder} has no run.json: the run has not ended yet")
+    title = f"{provenance.get('archive') or run_folder.resolve().name}"
+    target = output or run_folder / "report.html"
+    write_atomically(target, render(title, rows, provenance, Pictures(run_folder / "pictures"), change).encode())
+    typer.echo(f"{target}")
