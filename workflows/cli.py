@@ -16,14 +16,13 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from typer.exceptions import TyperException
 
 from catalogs.archive import Archive, open_archive
-from catalogs.images import read_image
 from pipeline.curate import Json
 from pipeline.errors import ConfigurationError, PilotageError
 from workflows import catalog_cli, doctor_cli, pose_cli, query_cli, report_cli, sample_cli, status_cli
 from workflows.ck import FOLDER, write_c_kernels
 from workflows.config import Configuration, load_configuration, parse_setting
 from workflows.execute import ClusterOptions
-from workflows.plan import Plan, make_plan
+from workflows.plan import Plan, ids_of, make_plan
 from workflows.report import (
     compare,
     offsets,
@@ -117,6 +116,7 @@ def run(
     settings: SetOption = [],  # noqa: B006
     verify: VerifyOption = False,
     verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Log each technique's rotation.")] = False,
+    pictures: Annotated[str, typer.Option(help="RUN/pictures of: all, failed, sample:N, none.")] = "none",
 ) -> None:
     """Navigate an archive; run again after a kill or a change, and only what is missing is done.
 
@@ -131,11 +131,19 @@ def run(
     # The death of a worker closes a socket under our hands, which is no reason to end.
     signal.signal(signal.SIGPIPE, signal.SIG_IGN)
     refuse_foreign(folder)
-    work = make_plan(*_open(archive, config, settings), folder, verify)
+    if pictures != "none":
+        from workflows.pictures import chosen, draw_all
+
+        # What is wrong is said before the run.
+        chosen(folder, [], pictures)
+    opened, configuration = _open(archive, config, settings)
+    work = make_plan(opened, configuration, folder, verify)
     options = ClusterOptions(0 if serial else workers, scheduler, memory_limit)
     console = Console(stderr=True)
     with _follow(console, work) as listener:
         statuses = execute(work, options, listener)
+    if pictures != "none":
+        draw_all(opened, folder, chosen(folder, ids_of(work.every), pictures))
     counts = ", ".join(f"{count} {status}" for status, count in sorted(statuses.items()))
     console.print(
         f"{len(work.every)} images: {counts}. Tables and images/*.json in {output}",
@@ -233,17 +241,24 @@ def _document(run_folder: Path, image: str) -> dict[str, Json]:
 def picture(
     run_folder: RunArg,
     archive: ArchiveArg,
-    image: Annotated[str, typer.Argument(help="Image id.")],
-    output: Annotated[Path, typer.Option("--output", "-o", help="PNG to write.")],
+    images: Annotated[list[str], typer.Argument(metavar="IMAGE...", help="Image ids.")],
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", help="PNG to write, for one image; RUN/pictures/IMAGE.png.")
+    ] = None,
 ) -> None:
-    """Draw one image with what was predicted, used and refused."""
+    """Draw images with what was predicted, used and refused."""
     # Drawing libraries take half a second to load, which no other command should pay.
-    from workflows.picture import draw_image
+    from workflows.pictures import draw, draw_all
 
-    document = _document(run_folder, image)
-    path = str(document["provenance"]["image_path"])  # type: ignore[call-overload, index]
-    raw = read_image(open_archive(archive, {}).read(path), path)
-    write_atomically(output, draw_image(raw.pixels, document))
+    documents = [_document(run_folder, image) for image in images]
+    opened = open_archive(archive, {})
+    if output is None:
+        for path in draw_all(opened, RunFolder(run_folder), images):
+            typer.echo(f"{path}")
+        return
+    if len(images) > 1:
+        raise ConfigurationError("--output is for one image")
+    write_atomically(output, draw(opened, documents[0]))
     typer.echo(f"{output}")
 
 

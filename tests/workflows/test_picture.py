@@ -5,12 +5,16 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
+from catalogs.archive import open_archive
 from catalogs.images import read_image
+from pipeline.errors import ConfigurationError
 from tests.scenes.runs import run_archive
+from workflows.cli import app
 from workflows.picture import draw_image
+from workflows.pictures import chosen, draw_all
 from workflows.samples.options import StarSampleOptions
 from workflows.samples.stars import make_star_sample
-from workflows.store import read_json
+from workflows.store import RunFolder, read_json
 
 
 @pytest.fixture(scope="module")
@@ -39,3 +43,28 @@ def test_an_image_without_an_answer_still_has_a_picture(run: Path) -> None:
     assert document is not None
     document |= {"offset_px": None, "sigma_px": None, "techniques": [], "status": "failed"}
     assert draw_image(np.zeros((100, 100), np.float32), document).startswith(b"\x89PNG")
+
+
+def test_a_run_keeps_the_pictures_that_are_asked_for(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder, archive = RunFolder(run / "run"), open_archive(str(run / "archive"), {})
+    ids = [path.stem for path in folder.images.glob("*.json")]
+    assert chosen(folder, ids, "all") == sorted(ids)
+    assert chosen(folder, ids, "failed") == []
+    one = chosen(folder, ids, "sample:1")
+    assert len(one) == 1
+    with pytest.raises(ConfigurationError, match="sample:N"):
+        chosen(folder, ids, "sample:x")
+    first = draw_all(archive, folder, one)[0]
+    made = first.stat().st_mtime_ns
+    assert draw_all(archive, folder, one)[0].stat().st_mtime_ns == made
+    app(["picture", str(run / "run"), str(run / "archive"), *ids], standalone_mode=False)
+    assert capsys.readouterr().out.split() == [str(folder.root / "pictures" / f"{i}.png") for i in ids]
+
+
+def test_an_image_that_is_gone_costs_its_picture_alone(run: Path, caplog: pytest.LogCaptureFixture) -> None:
+    folder, archive = RunFolder(run / "run"), open_archive(str(run / "archive"), {})
+    gone = sorted(path.stem for path in folder.images.glob("*.json"))[-1]
+    (run / "archive" / "frames" / f"{gone}.fits").write_bytes(b"no image")
+    (folder.root / "pictures" / f"{gone}.png").unlink(missing_ok=True)
+    assert draw_all(archive, folder, [gone]) == []
+    assert gone in caplog.text

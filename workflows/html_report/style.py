@@ -35,7 +35,7 @@ function show(id) {
   picture.alt = "Summary picture of " + id;
   picture.onerror = () => {
     const said = document.createElement("p");
-    said.textContent = "No picture beside this report: pilotage picture RUN ARCHIVE " + id + " -o " + id + ".png";
+    said.textContent = "No picture beside this report: pilotage picture RUN ARCHIVE " + id;
     body.replaceChildren(said);
   };
   picture.src = pictures[id] || "pictures/" + encodeURIComponent(id) + ".png";

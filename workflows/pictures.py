@@ -1,0 +1,110 @@
+"""Summary pictures of a run's images, kept in ``RUN/pictures``."""
+
+import logging
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from catalogs.archive import Archive
+from catalogs.images import read_image
+from pipeline.curate import Json
+from pipeline.errors import ConfigurationError, PilotageError
+from workflows.picture import draw_image
+from workflows.store import RunFolder, read_json, write_atomically
+
+_LOG = logging.getLogger("pilotage")
+
+
+def chosen(folder: RunFolder, image_ids: Sequence[str], which: str) -> list[str]:
+    """Images of which pictures are wanted.
+
+    Parameters
+    ----------
+    folder
+        The run.
+    image_ids
+        All of its images.
+    which
+        ``all``, ``failed`` (all without an answer), ``sample:N`` (evenly over the sorted ids) or ``none``.
+
+    Returns
+    -------
+    list of str
+        Sorted ids.
+
+    Raises
+    ------
+    ConfigurationError
+        If it is none of these.
+    """
+    ids = sorted(image_ids)
+    count = which.removeprefix("sample:")
+    if which == "none":
+        return []
+    if which == "all":
+        return ids
+    if which == "failed":
+        documents = {image_id: read_json(folder.document(image_id)) for image_id in ids}
+        return [image_id for image_id, said in documents.items() if said is not None and said["status"] != "success"]
+    if which.startswith("sample:") and count.isdecimal() and int(count) > 0:
+        return [ids[k] for k in np.unique(np.linspace(0, len(ids) - 1, int(count)).astype(int))] if ids else []
+    raise ConfigurationError(f"pictures: {which!r} is none of all, failed, sample:N, none")
+
+
+def draw(archive: Archive, document: dict[str, Json]) -> bytes:
+    """Picture of one image.
+
+    Parameters
+    ----------
+    archive
+        Where the image is.
+    document
+        Of the image.
+
+    Returns
+    -------
+    bytes
+        PNG.
+
+    Raises
+    ------
+    ImageUnreadableError
+        If the image cannot be read.
+    """
+    path = str(document["provenance"]["image_path"])  # type: ignore[call-overload, index]
+    return draw_image(read_image(archive.read(path), path).pixels, document)
+
+
+def draw_all(archive: Archive, folder: RunFolder, image_ids: Sequence[str]) -> list[Path]:
+    """Draw pictures that are missing or older than their image's document.
+
+    Parameters
+    ----------
+    archive
+        Where the images are.
+    folder
+        The run.
+    image_ids
+        Which.
+
+    Returns
+    -------
+    list of pathlib.Path
+        All pictures; one that cannot be drawn is a warning, never the end of a run.
+    """
+    place = folder.root / "pictures"
+    place.mkdir(exist_ok=True)
+    drawn = []
+    for image_id in image_ids:
+        target, source = place / f"{image_id}.png", folder.document(image_id)
+        if not (target.exists() and target.stat().st_mtime_ns >= source.stat().st_mtime_ns):
+            document = read_json(source)
+            try:
+                if document is not None:
+                    write_atomically(target, draw(archive, document))
+            except PilotageError as error:
+                _LOG.warning("no picture of %s: %s", image_id, error)
+                continue
+        drawn.append(target)
+    return drawn
