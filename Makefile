@@ -19,11 +19,12 @@ demo: install
 	$(BIN)/pilotage run $(DEMO)/stars --output $(DEMO)/run || test $$? -eq 1
 	$(BIN)/pilotage show $(DEMO)/run --truth $(DEMO)/stars/truth.json --limit 20
 	$(BIN)/pilotage sample flyby $(DEMO)/flyby
-	$(BIN)/pilotage run $(DEMO)/flyby --output $(DEMO)/flyby-run || test $$? -eq 1
+	$(BIN)/pilotage run $(DEMO)/flyby --output $(DEMO)/flyby-run --pictures all || test $$? -eq 1
 	$(BIN)/pilotage show $(DEMO)/flyby-run --truth $(DEMO)/flyby/truth.json --limit 24
+	$(BIN)/pilotage report $(DEMO)/flyby-run
 	$(BIN)/pilotage sample aerial $(DEMO)/aerial
 	$(BIN)/pilotage pose $(DEMO)/aerial/matches.parquet --cameras $(DEMO)/aerial/cameras.json --output $(DEMO)/aerial/views.parquet --arcs $(DEMO)/aerial/arcs || test $$? -eq 1
-	@echo "The archives are in $(DEMO)/stars and $(DEMO)/flyby, the answers in $(DEMO)/run and $(DEMO)/flyby-run: offsets/ and the other tables, images/*.json."
+	@echo "The archives are in $(DEMO)/stars and $(DEMO)/flyby, the answers in $(DEMO)/run and $(DEMO)/flyby-run: offsets/ and the other tables, images/*.json. Open $(DEMO)/flyby-run/report.html in a browser."
 
 test: install
 	$(BIN)/python -m pytest -n 2
