@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-import yaml
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from typer.exceptions import TyperException
@@ -18,7 +17,7 @@ from typer.exceptions import TyperException
 from catalogs.archive import Archive, open_archive
 from pipeline.curate import Json
 from pipeline.errors import ConfigurationError, PilotageError
-from workflows import catalog_cli, doctor_cli, pose_cli, query_cli, report_cli, sample_cli, status_cli
+from workflows import catalog_cli, config_cli, doctor_cli, pose_cli, query_cli, report_cli, sample_cli, status_cli
 from workflows.ck import FOLDER, write_c_kernels
 from workflows.config import Configuration, load_configuration, parse_setting
 from workflows.execute import ClusterOptions
@@ -41,6 +40,7 @@ app = typer.Typer(
 )  # fmt: skip
 app.add_typer(sample_cli.app, name="sample")
 app.add_typer(catalog_cli.app, name="catalog")
+app.add_typer(config_cli.app, name="config")
 app.command()(pose_cli.pose)
 app.command()(report_cli.report)
 app.command()(query_cli.query)
@@ -274,12 +274,6 @@ def ck(
     folder = RunFolder(run_folder)
     for path in write_c_kernels(folder, *_open(archive, config, settings), output or run_folder / FOLDER):
         typer.echo(f"{path}")
-
-
-@app.command("config")
-def show_config(config: ConfigOption = [], settings: SetOption = []) -> None:  # noqa: B006
-    """Print the configuration that a run would use, as YAML."""
-    typer.echo(yaml.safe_dump(load_configuration(config, settings).model_dump(mode="json"), sort_keys=False))
 
 
 def main() -> None:

@@ -81,6 +81,29 @@ def load_configuration(user_files: Sequence[Path] = (), settings: Sequence[str] 
     ConfigurationError
         One line that names the file, the key and what is allowed.
     """
+    return trace_configuration(user_files, settings)[0]
+
+
+def trace_configuration(
+    user_files: Sequence[Path] = (), settings: Sequence[str] = ()
+) -> tuple[Configuration, dict[str, str]]:
+    """The same with where each value comes from.
+
+    Parameters
+    ----------
+    user_files, settings
+        As of :func:`load_configuration`.
+
+    Returns
+    -------
+    tuple
+        Configuration; file or setting by dotted key, for keys that any of them names.
+
+    Raises
+    ------
+    ConfigurationError
+        As :func:`load_configuration`.
+    """
     tree: Tree = {}
     origin: dict[Path_, str] = {}
     for name, text in _shipped():
@@ -94,9 +117,10 @@ def load_configuration(user_files: Sequence[Path] = (), settings: Sequence[str] 
     for setting in settings:
         _merge(tree, parse_setting(setting), f"{_COMMAND_LINE} {setting}", origin)
     try:
-        return Configuration.model_validate(tree)
+        configuration = Configuration.model_validate(tree)
     except ValidationError as error:
         raise ConfigurationError(_explain(error, origin)) from error
+    return configuration, {".".join(path): source for path, source in origin.items()}
 
 
 def _shipped() -> Iterator[tuple[str, str]]:
