@@ -14,13 +14,23 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from typer.exceptions import TyperException
 
-from catalogs.archive import Archive, open_archive
+from catalogs.archive import open_archive
 from pipeline.curate import Json
 from pipeline.errors import ConfigurationError, PilotageError
-from workflows import catalog_cli, config_cli, doctor_cli, pose_cli, query_cli, report_cli, sample_cli, status_cli
+from workflows import (
+    catalog_cli,
+    config_cli,
+    doctor_cli,
+    pose_cli,
+    query_cli,
+    report_cli,
+    sample_cli,
+    status_cli,
+    validate_cli,
+)
 from workflows.ck import FOLDER, write_c_kernels
-from workflows.config import Configuration, load_configuration, parse_setting
 from workflows.execute import ClusterOptions
+from workflows.opening import open_both
 from workflows.plan import Plan, ids_of, make_plan
 from workflows.report import (
     compare,
@@ -45,10 +55,10 @@ app.command()(pose_cli.pose)
 app.command()(report_cli.report)
 app.command()(query_cli.query)
 app.command()(doctor_cli.doctor)
+app.command()(validate_cli.validate)
 app.command()(status_cli.status)
 
 _LOG = logging.getLogger("pilotage")
-_ARCHIVE_KEY = "archive."
 _LOG_EVERY_S = 5.0
 _LOG_WIDTH = 130
 
@@ -67,25 +77,6 @@ OutputOption = Annotated[
 VerifyOption = Annotated[bool, typer.Option("--verify", help="Read inputs again instead of trusting size and time.")]
 
 
-def _open(archive: str, config: list[Path], settings: list[str]) -> tuple[Archive, Configuration]:
-    mine = [s for s in settings if not s.startswith(_ARCHIVE_KEY)]
-    overrides: dict[str, object] = {}
-    for setting in settings:
-        if setting.startswith(_ARCHIVE_KEY):
-            _merge(overrides, parse_setting(setting.removeprefix(_ARCHIVE_KEY)))
-    configuration = load_configuration(config, mine)
-    return open_archive(archive, overrides), configuration
-
-
-def _merge(tree: dict[str, object], addition: dict[str, object]) -> None:
-    for key, value in addition.items():
-        old = tree.get(key)
-        if isinstance(old, dict) and isinstance(value, dict):
-            _merge(old, value)
-        else:
-            tree[key] = value
-
-
 @app.command()
 def plan(
     archive: ArchiveArg,
@@ -96,7 +87,7 @@ def plan(
 ) -> None:
     """Say what `run` would do, and do nothing."""
     refuse_foreign(RunFolder(output))
-    work = make_plan(*_open(archive, config, settings), RunFolder(output), verify)
+    work = make_plan(*open_both(archive, config, settings), RunFolder(output), verify)
     typer.echo(f"{len(work.every)} images, {len(work.every) - len(work.todo)} answered, {len(work.todo)} to do")
     for ref in work.todo[:20]:
         typer.echo(f"  {ref.image_id}  {ref.path}{'' if ref.exists else '  (not there)'}")
@@ -136,7 +127,7 @@ def run(
 
         # What is wrong is said before the run.
         chosen(folder, [], pictures)
-    opened, configuration = _open(archive, config, settings)
+    opened, configuration = open_both(archive, config, settings)
     work = make_plan(opened, configuration, folder, verify)
     options = ClusterOptions(0 if serial else workers, scheduler, memory_limit)
     console = Console(stderr=True)
@@ -272,7 +263,7 @@ def ck(
 ) -> None:
     """Write corrected pointing as SPICE C-kernels, and a meta-kernel that loads them after the archive's own."""
     folder = RunFolder(run_folder)
-    for path in write_c_kernels(folder, *_open(archive, config, settings), output or run_folder / FOLDER):
+    for path in write_c_kernels(folder, *open_both(archive, config, settings), output or run_folder / FOLDER):
         typer.echo(f"{path}")
 
 

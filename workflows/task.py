@@ -74,6 +74,37 @@ class Stopwatch:
         return time.perf_counter() - self._start
 
 
+@dataclass(frozen=True)
+class Readiness:
+    """Whether an image can be navigated at all.
+
+    Attributes
+    ----------
+    image_id
+        The image.
+    reason
+        Why not, a status reason; empty where it can.
+    detail
+        In one line.
+    """
+
+    image_id: str
+    reason: str
+    detail: str
+
+
+@dataclass(frozen=True, eq=False)
+class _Prepared:
+    """All that navigating one image needs."""
+
+    raw: RawImage
+    label: Label
+    state: State
+    block: InstrumentBlock | None
+    source: str
+    stars: StarTable
+
+
 class Inputs:
     """Files that decide one image's answer, as they were when they were read.
 
@@ -240,7 +271,35 @@ class ImageRunner:
             document = self._error(ref, inputs, StatusReason.INTERNAL_ERROR, _where(error))
         return document, to_json(document), lasting
 
-    def _document(self, ref: ImageRef, inputs: Inputs, watch: Stopwatch) -> dict[str, Json]:
+    def examine(self, ref: ImageRef) -> Readiness:
+        """Read an image's pixels, label, geometry and stars, as :meth:`run` would, and navigate nothing.
+
+        Parameters
+        ----------
+        ref
+            The image.
+
+        Returns
+        -------
+        Readiness
+            Why it could not be navigated, if it could not.
+        """
+        inputs = Inputs(self._setup.archive)
+        try:
+            for path in self._setup.inputs_of(ref):
+                inputs.read(path)
+            prepared = self._prepared(ref, inputs, Stopwatch())
+        except ImageFailure as failure:
+            return Readiness(ref.image_id, failure.reason.value, failure.detail)
+        except OSError as error:
+            detail = f"{ref.path}: {error.strerror or type(error).__name__}"
+            return Readiness(ref.image_id, StatusReason.IMAGE_UNREADABLE.value, detail)
+        except _BUGS as error:
+            return Readiness(ref.image_id, StatusReason.INTERNAL_ERROR.value, _where(error))
+        state = prepared.state
+        return Readiness(ref.image_id, "", f"{state.mission} {state.camera}, geometry by {prepared.source}")
+
+    def _prepared(self, ref: ImageRef, inputs: Inputs, watch: Stopwatch) -> _Prepared:
         data = inputs.data[ref.path]
         if data is None:
             raise ImageError(StatusReason.IMAGE_NOT_FOUND, f"{ref.path} is not there")
@@ -253,11 +312,18 @@ class ImageRunner:
         watch.lap("geometry")
         stars = self._stars(ref, state, inputs)
         watch.lap("catalog")
+        return _Prepared(raw, label, state, block, source, stars)
+
+    def _document(self, ref: ImageRef, inputs: Inputs, watch: Stopwatch) -> dict[str, Json]:
+        made = self._prepared(ref, inputs, watch)
         navigation: Navigation = navigate(
-            raw.pixels, _flags(raw, block), state, stars, self._options, watch.lap, self._maplets.sources(state)
-        )
+            made.raw.pixels, _flags(made.raw, made.block), made.state, made.stars, self._options, watch.lap,
+            self._maplets.sources(made.state),
+        )  # fmt: skip
         rank = self._setup.configuration.orchestrator.rank
-        return build_metadata_dict(navigation, rank, self._provenance(ref, inputs, source), label.document())
+        return build_metadata_dict(
+            navigation, rank, self._provenance(ref, inputs, made.source), made.label.document()
+        )  # fmt: skip
 
     def _state(
         self, ref: ImageRef, raw: RawImage, label: Label, inputs: Inputs
