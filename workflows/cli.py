@@ -30,6 +30,7 @@ from workflows import (
 )
 from workflows.ck import FOLDER, write_c_kernels
 from workflows.execute import ClusterOptions
+from workflows.notify import notify
 from workflows.opening import open_both
 from workflows.plan import Plan, ids_of, make_plan
 from workflows.report import (
@@ -108,6 +109,7 @@ def run(
     verify: VerifyOption = False,
     verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Log each technique's rotation.")] = False,
     pictures: Annotated[str, typer.Option(help="RUN/pictures of: all, failed, sample:N, none.")] = "none",
+    tell: Annotated[str | None, typer.Option("--notify", help="Command that gets run.json as its input.")] = None,
 ) -> None:
     """Navigate an archive; run again after a kill or a change, and only what is missing is done.
 
@@ -135,6 +137,8 @@ def run(
         statuses = execute(work, options, listener)
     if pictures != "none":
         draw_all(opened, folder, chosen(folder, ids_of(work.every), pictures))
+    if tell is not None:
+        notify(tell, folder)
     counts = ", ".join(f"{count} {status}" for status, count in sorted(statuses.items()))
     console.print(
         f"{len(work.every)} images: {counts}. Tables and images/*.json in {output}",

@@ -11,7 +11,7 @@ from workflows.picture_canvas import GREY, ORANGE, PURPLE, SKY, YELLOW, Canvas, 
 
 _LINES = ("limb", "terminator")
 # Neighbouring pieces of one line lie closer than this many medians of their distances.
-_GAP = 4.0
+_GAP = 2.2
 _NAMES = 24
 _NAME_LETTERS = 16
 _NAME_SIZE = 11
