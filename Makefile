@@ -3,7 +3,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 DEMO := outputs/demo
 
-.PHONY: install demo test quick check bench bench-dask clean
+.PHONY: install demo docs test quick check bench bench-dask clean
 
 install: $(VENV)/installed
 
@@ -35,6 +35,9 @@ quick: install
 check: install
 	$(BIN)/ruff check .
 	$(BIN)/mypy
+
+docs: install
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --site-dir build/site
 
 bench-dask: install
 	$(BIN)/python -m workflows.bench_dask
