@@ -178,7 +178,6 @@ def test_killing_workers_loses_nothing(
     assert "0 to do" in pilotage("plan", lorri_archive, "--output", tmp_path / "run").out
 
 
-@pytest.mark.slow
 def _interrupted(archive: Path, folder: Path) -> Running:
     """A run that got a SIGINT after its first answer, and has ended."""
     folder.mkdir()
@@ -189,11 +188,12 @@ def _interrupted(archive: Path, folder: Path) -> Running:
     return running
 
 
+@pytest.mark.slow
 def test_an_interrupted_run_says_so_and_goes_on(
     lorri_archive: Path, tmp_path: Path, undisturbed: dict[str, bytes]
 ) -> None:
-    # A fast machine may be through before the signal arrives: three tries.
-    for attempt in range(3):
+    # A run may be through before this process, waiting for a core, sends its signal: then another try.
+    for attempt in range(10):
         folder = tmp_path / f"try-{attempt}"
         running = _interrupted(lorri_archive, folder)
         if running.ended() == 130:
