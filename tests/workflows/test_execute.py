@@ -40,6 +40,9 @@ class Running:
         self.run = run
         self._log = run.parent / f"{run.name}.log"
         command = [sys.executable, "-m", "workflows.cli", "run", archive, "--output", run, *arguments]
+        # Where the tests run in a shell's background, interrupts are ignored, and a child would inherit that.
+        if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
         with self._log.open("w") as log:
             self.process = subprocess.Popen(
                 list(map(str, command)), cwd=ROOT, stdout=log, stderr=log, start_new_session=True
