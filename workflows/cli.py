@@ -253,7 +253,7 @@ def picture(
         return
     if len(images) > 1:
         raise ConfigurationError("--output is for one image")
-    write_atomically(output, draw(opened, documents[0]))
+    write_atomically(output, draw(opened, RunFolder(run_folder), documents[0]))
     typer.echo(f"{output}")
 
 

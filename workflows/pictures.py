@@ -3,13 +3,15 @@
 import logging
 from collections.abc import Sequence
 from pathlib import Path
+from posixpath import basename, dirname
 
 import numpy as np
 
-from catalogs.archive import Archive
+from catalogs.archive import SIDECAR_SUFFIX, STARS_SUFFIX, Archive
 from catalogs.images import read_image
 from pipeline.curate import Json
-from pipeline.errors import ConfigurationError, PilotageError
+from pipeline.errors import ConfigurationError, ImageError, PilotageError
+from pipeline.status import StatusReason
 from workflows.picture import draw_image
 from workflows.store import RunFolder, read_json, write_atomically
 
@@ -52,13 +54,15 @@ def chosen(folder: RunFolder, image_ids: Sequence[str], which: str) -> list[str]
     raise ConfigurationError(f"pictures: {which!r} is none of all, failed, sample:N, none")
 
 
-def draw(archive: Archive, document: dict[str, Json]) -> bytes:
+def draw(archive: Archive, folder: RunFolder, document: dict[str, Json]) -> bytes:
     """Picture of one image.
 
     Parameters
     ----------
     archive
         Where the image is.
+    folder
+        The run, whose marks tell which files belong to the image.
     document
         Of the image.
 
@@ -69,11 +73,29 @@ def draw(archive: Archive, document: dict[str, Json]) -> bytes:
 
     Raises
     ------
-    ImageUnreadableError
+    ImageError
         If the image cannot be read.
     """
     path = str(document["provenance"]["image_path"])  # type: ignore[call-overload, index]
-    return draw_image(read_image(archive.read(path), path).pixels, document)
+    try:
+        beside = {basename(name): archive.read(name) for name in _beside(folder, str(document["image_id"]), path)}
+        data = archive.read(path)
+    except OSError as error:
+        detail = f"{path}: {error.strerror or type(error).__name__}"
+        raise ImageError(StatusReason.IMAGE_UNREADABLE, detail) from error
+    return draw_image(read_image(data, path, beside).pixels, document)
+
+
+def _beside(folder: RunFolder, image_id: str, path: str) -> list[str]:
+    """Files that make one image together with a path: a detached label, or the pixels of a label."""
+    mark = read_json(folder.mark(image_id))
+    inputs = mark.get("inputs") if mark else None
+    others = (SIDECAR_SUFFIX, STARS_SUFFIX)
+    return [
+        name for name, entry in (inputs.items() if isinstance(inputs, dict) else ())
+        if name != path and dirname(name) == dirname(path) and not name.endswith(others)
+        and isinstance(entry, dict) and entry["sha256"] is not None
+    ]  # fmt: skip
 
 
 def draw_all(archive: Archive, folder: RunFolder, image_ids: Sequence[str]) -> list[Path]:
@@ -100,9 +122,10 @@ def draw_all(archive: Archive, folder: RunFolder, image_ids: Sequence[str]) -> l
         target, source = place / f"{image_id}.png", folder.document(image_id)
         if not (target.exists() and target.stat().st_mtime_ns >= source.stat().st_mtime_ns):
             document = read_json(source)
+            if document is None:
+                continue
             try:
-                if document is not None:
-                    write_atomically(target, draw(archive, document))
+                write_atomically(target, draw(archive, folder, document))
             except PilotageError as error:
                 _LOG.warning("no picture of %s: %s", image_id, error)
                 continue

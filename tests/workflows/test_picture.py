@@ -8,10 +8,12 @@ from matplotlib.image import imread
 from catalogs.archive import open_archive
 from catalogs.images import read_image
 from pipeline.errors import ConfigurationError
+from tests.catalogs.planetary import pds3_label
 from tests.scenes.runs import run_archive
 from workflows.cli import app
 from workflows.picture import draw_image
 from workflows.pictures import chosen, draw_all
+from workflows.run import EXIT_SOME_IN_ERROR
 from workflows.samples.options import StarSampleOptions
 from workflows.samples.stars import make_star_sample
 from workflows.store import RunFolder, read_json
@@ -68,3 +70,25 @@ def test_an_image_that_is_gone_costs_its_picture_alone(run: Path, caplog: pytest
     (folder.root / "pictures" / f"{gone}.png").unlink(missing_ok=True)
     assert draw_all(archive, folder, [gone]) == []
     assert gone in caplog.text
+
+
+def test_an_image_that_never_was_costs_its_picture_alone(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    options = StarSampleOptions(frames=2, seed=3, cameras=("lorri_4x4",), processes=1)
+    make_star_sample(tmp_path / "archive", options)
+    there = next((tmp_path / "archive" / "frames").glob("*.fits"))
+    listed = f"archive.images=[frames/{there.name}, frames/gone.fits]"
+    command = ["run", str(tmp_path / "archive"), "--output", str(tmp_path / "run"), "--serial", "--set", listed]
+    assert app([*command, "--pictures", "all"], standalone_mode=False) == EXIT_SOME_IN_ERROR
+    assert [path.name for path in (tmp_path / "run" / "pictures").iterdir()] == [f"{there.stem}.png"]
+    assert "no picture of frames__gone" in caplog.text
+
+
+def test_a_label_finds_its_pixels(tmp_path: Path) -> None:
+    archive = tmp_path / "archive"
+    archive.mkdir()
+    (archive / "a.lbl").write_bytes(pds3_label('"pixels.dat"', "UNSIGNED_INTEGER", 8, (32, 48)))
+    (archive / "pixels.dat").write_bytes(np.arange(32 * 48, dtype=np.uint8).tobytes())
+    (archive / "archive.yaml").write_text('images: ["a.lbl"]\n')
+    run_archive(archive, tmp_path / "run")
+    drawn = draw_all(open_archive(str(archive), {}), RunFolder(tmp_path / "run"), ["pixels"])
+    assert [path.name for path in drawn if path.exists()] == ["pixels.png"]
