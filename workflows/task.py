@@ -4,11 +4,12 @@ import gc
 import hashlib
 import time
 import traceback
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from posixpath import basename, dirname
+from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -43,6 +44,7 @@ _BUGS = (
 )  # fmt: skip
 _PACKAGES = ("pipeline", "catalogs", "workflows")
 _MESHES_KEPT = 16
+_Made = TypeVar("_Made")
 
 
 @dataclass(frozen=True)
@@ -91,6 +93,18 @@ class Readiness:
     image_id: str
     reason: str
     detail: str
+
+
+@dataclass(frozen=True)
+class _Fault:
+    """Why an image has no answer.
+
+    ``lasting`` is false where the network or disk may answer tomorrow: without a mark the next run tries again.
+    """
+
+    reason: StatusReason
+    detail: str
+    lasting: bool = True
 
 
 @dataclass(frozen=True, eq=False)
@@ -253,23 +267,16 @@ class ImageRunner:
 
     def _answer(self, ref: ImageRef, inputs: Inputs, watch: Stopwatch) -> tuple[dict[str, Json], bytes, bool]:
         """Document of an image whatever happens, its bytes, and whether the same inputs would give it again."""
-        lasting = True
-        try:
-            # All of them, also where the first one fails: the mark is to know what was there.
-            for path in self._setup.inputs_of(ref):
-                inputs.read(path)
+
+        def work() -> tuple[dict[str, Json], bytes]:
             document = self._document(ref, inputs, watch)
-            return document, to_json(document), lasting
-        except ImageFailure as failure:
-            document = self._error(ref, inputs, failure.reason, failure.detail)
-        except OSError as error:
-            # The network or disk may answer tomorrow: without a mark the next run tries again.
-            lasting = False
-            detail = f"{ref.path}: {error.strerror or type(error).__name__}"
-            document = self._error(ref, inputs, StatusReason.IMAGE_UNREADABLE, detail)
-        except _BUGS as error:
-            document = self._error(ref, inputs, StatusReason.INTERNAL_ERROR, _where(error))
-        return document, to_json(document), lasting
+            return document, to_json(document)
+
+        made = self._attempt(ref, inputs, work)
+        if isinstance(made, _Fault):
+            document = self._error(ref, inputs, made.reason, made.detail)
+            return document, to_json(document), made.lasting
+        return *made, True
 
     def examine(self, ref: ImageRef) -> Readiness:
         """Read an image's pixels, label, geometry and stars, as :meth:`run` would, and navigate nothing.
@@ -285,19 +292,26 @@ class ImageRunner:
             Why it could not be navigated, if it could not.
         """
         inputs = Inputs(self._setup.archive)
+        made = self._attempt(ref, inputs, lambda: self._prepared(ref, inputs, Stopwatch()))
+        if isinstance(made, _Fault):
+            return Readiness(ref.image_id, made.reason.value, made.detail)
+        state = made.state
+        return Readiness(ref.image_id, "", f"{state.mission} {state.camera}, geometry by {made.source}")
+
+    def _attempt(self, ref: ImageRef, inputs: Inputs, work: Callable[[], _Made]) -> _Made | _Fault:
+        """Read an image's files and work on them: the one place where what goes wrong becomes a reason."""
         try:
+            # All of them, also where the first one fails: the mark is to know what was there.
             for path in self._setup.inputs_of(ref):
                 inputs.read(path)
-            prepared = self._prepared(ref, inputs, Stopwatch())
+            return work()
         except ImageFailure as failure:
-            return Readiness(ref.image_id, failure.reason.value, failure.detail)
+            return _Fault(failure.reason, failure.detail)
         except OSError as error:
             detail = f"{ref.path}: {error.strerror or type(error).__name__}"
-            return Readiness(ref.image_id, StatusReason.IMAGE_UNREADABLE.value, detail)
+            return _Fault(StatusReason.IMAGE_UNREADABLE, detail, lasting=False)
         except _BUGS as error:
-            return Readiness(ref.image_id, StatusReason.INTERNAL_ERROR.value, _where(error))
-        state = prepared.state
-        return Readiness(ref.image_id, "", f"{state.mission} {state.camera}, geometry by {prepared.source}")
+            return _Fault(StatusReason.INTERNAL_ERROR, _where(error))
 
     def _prepared(self, ref: ImageRef, inputs: Inputs, watch: Stopwatch) -> _Prepared:
         data = inputs.data[ref.path]
