@@ -6,7 +6,10 @@ from typing import Annotated
 import typer
 
 from pipeline.errors import ConfigurationError
+from workflows.maplet_cli import import_spc
 from workflows.samples.aerial import AerialOptions, make_aerial_sample
+from workflows.samples.asteroid import MAPLETS, SPC, make_asteroid_sample
+from workflows.samples.asteroid_options import AsteroidOptions
 from workflows.samples.flyby import make_flyby_sample
 from workflows.samples.flyby_options import FlybyOptions
 from workflows.samples.options import StarSampleOptions
@@ -79,3 +82,24 @@ def aerial(
     except (ValueError, OSError) as error:
         raise ConfigurationError(f"{directory}: {error}") from error
     typer.echo(f"{frames} frames, matches.parquet, cameras.json and truth.json in {path.parent}")
+
+
+@app.command()
+def asteroid(
+    directory: Annotated[Path, typer.Argument(help="New or empty folder.")],
+    images: Annotated[int, typer.Option(min=1, help="Images to make.")] = 12,
+    seed: Annotated[int, typer.Option(min=0, help="Same seed, same bytes.")] = 1,
+    camera: Annotated[str, typer.Option(help="cassini_wac_sum2 (512 px), or cassini_wac (1024 px).")] = (
+        AsteroidOptions().camera
+    ),
+    coverage: Annotated[float, typer.Option(min=0.01, max=20.0, help="Maplets over each place, per scale.")] = 2.0,
+    processes: Annotated[int, typer.Option(min=1, help="Processes that draw.")] = 2,
+) -> None:
+    """An asteroid mapped by maplets, before a camera whose attitude and place are known badly, with SPICE kernels."""
+    options = AsteroidOptions(frames=images, seed=seed, camera=camera, coverage=coverage, processes=processes)
+    try:
+        path = make_asteroid_sample(directory, options)
+    except (ValueError, OSError) as error:
+        raise ConfigurationError(f"{directory}: {error}") from error
+    import_spc(path.parent / SPC, path.parent / MAPLETS)
+    typer.echo(f"{images} images, kernels, maplets and truth.json in {path.parent}")

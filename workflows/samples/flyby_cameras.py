@@ -76,6 +76,11 @@ class FlybyCamera:
         """Name in truth and options."""
         return self.optics.name
 
+    @property
+    def letter(self) -> str:
+        """First letter of the product ids of Cassini's narrow (N) or wide (W) camera."""
+        return "W" if self.frame.endswith("WAC") else "N"
+
 
 CASSINI = Spacecraft("CASSINI ORBITER", "cas", -82, "CASSINI_SC_COORD", -82000, CASSINI_CLOCK, datetime(2007, 2, 3, 4))
 VOYAGER = Spacecraft("VOYAGER 2", "vg2", -32, "VG2_SCAN_PLATFORM", -32100, VOYAGER_CLOCK, datetime(1981, 6, 12, 9))
@@ -135,6 +140,38 @@ def _cassini() -> tuple[FlybyCamera, FlybyCamera]:
     return full, replace(full, optics=optics, wings=(0.03, 2.5), summation=2)
 
 
+def _cassini_wide(narrow: FlybyCamera) -> tuple[FlybyCamera, FlybyCamera]:
+    """Return the wide camera, full and summed 2x2; sources as for the narrow one, orientation nearly the same."""
+    k, k_lines = 83.33333, 83.34114
+    optics = replace(
+        narrow.optics,
+        name="cassini_wac",
+        focal_length_mm=200.7761,
+        k_px_per_mm=((k, 0.0), (0.0, k_lines)),
+        distortion_eps=(6.089e-5, 0.0, 4.93e-6, -7.228e-5, 0.0, 0.0),
+        psf_sigma_px=0.77,
+        search_margin_vu=(10.0, 20.0),
+    )
+    full = replace(
+        narrow,
+        optics=optics,
+        frame="CASSINI_ISS_WAC",
+        frame_id=-82361,
+        instrument_from_platform=_along((-1.0, 0.0004, 0.0002), (-0.0003, -1.0, -0.0006)),
+        wings=(0.03, 3.0),
+    )
+    summed = replace(
+        optics,
+        name="cassini_wac_sum2",
+        shape_vu=(512, 512),
+        k_px_per_mm=((k / 2.0, 0.0), (0.0, k_lines / 2.0)),
+        principal_point_vu=(255.5, 255.5),
+        psf_sigma_px=0.385,
+        search_margin_vu=(5.0, 10.0),
+    )
+    return full, replace(full, optics=summed, wings=(0.03, 1.5), summation=2)
+
+
 def _voyager() -> FlybyCamera:
     """Return Voyager 2's narrow camera as geometrically corrected products show it: 84.821429 px/mm, no distortion."""
     k = 84.821429
@@ -182,5 +219,6 @@ def _lorri() -> tuple[FlybyCamera, FlybyCamera]:
 
 def flyby_cameras() -> dict[str, FlybyCamera]:
     """Return every camera by its name."""
-    cameras = (*_cassini(), _voyager(), *_lorri())
+    narrow, summed = _cassini()
+    cameras = (narrow, summed, *_cassini_wide(narrow), _voyager(), *_lorri())
     return {camera.name: camera for camera in cameras}

@@ -135,7 +135,7 @@ class Shot:
     def image_id(self) -> str:
         """Product id and stem of the files."""
         if self.camera.stored == "cassini":
-            return f"N{CASSINI_CLOCK.fields(et_from_utc(self.stop_utc))[0]:010d}_1"
+            return f"{self.camera.letter}{CASSINI_CLOCK.fields(et_from_utc(self.stop_utc))[0]:010d}_1"
         if self.camera.stored == "voyager":
             count = VOYAGER_CLOCK.fields(self.et)
             return f"C{count[0]:05d}{count[1]:02d}_GEOMED"

@@ -100,11 +100,11 @@ def _write_pair(shot: Shot, folder: Path, data: bytes, label: str) -> list[Path]
 
 
 def write_cassini(shot: Shot, taken: Taken, folder: Path) -> list[Path]:
-    """Write a raw frame of Cassini's narrow camera; bytes where they suffice, else big-endian integers."""
+    """Write a raw frame of one of Cassini's cameras; bytes where they suffice, else big-endian integers."""
     pixels = taken.image.astype("u1" if taken.as_bytes else ">i2")
     stop_et = et_from_utc(shot.stop_utc)
     start, stop = (_count_text(CASSINI_CLOCK, et_from_utc(utc)) for utc in (shot.start_utc, shot.stop_utc))
-    mode = CASSINI_MODES[shot.camera.summation]
+    mode, letter = CASSINI_MODES[shot.camera.summation], shot.camera.letter
     times = {
         "IMAGE_MID_TIME": shot.utc,
         "IMAGE_TIME": shot.stop_utc,
@@ -117,12 +117,12 @@ def write_cassini(shot: Shot, taken: Taken, folder: Path) -> list[Path]:
         "GAIN_MODE_ID": f"{shot.camera.optics.gain_e_per_dn:.0f} ELECTRONS PER DN",
         "IMAGE_NUMBER": int(CASSINI_CLOCK.fields(stop_et)[0]),
         "INSTRUMENT_HOST_NAME": "CASSINI ORBITER",
-        "INSTRUMENT_ID": "ISSNA",
+        "INSTRUMENT_ID": f"ISS{letter}A",
         "INSTRUMENT_MODE_ID": mode,
-        "INSTRUMENT_NAME": "IMAGING SCIENCE SUBSYSTEM NARROW ANGLE",
+        "INSTRUMENT_NAME": f"IMAGING SCIENCE SUBSYSTEM {'WIDE' if letter == 'W' else 'NARROW'} ANGLE",
         "MISSING_LINES": taken.missing_lines,
         "MISSION_NAME": "CASSINI-HUYGENS",
-        "PRODUCT_ID": f"1_N{stop}",
+        "PRODUCT_ID": f"1_{letter}{stop}",
         "SPACECRAFT_CLOCK_CNT_PARTITION": 1,
         "SPACECRAFT_CLOCK_START_COUNT": start,
         "SPACECRAFT_CLOCK_STOP_COUNT": stop,
