@@ -4,6 +4,7 @@ Source: seed 001 eq. 1.6, 1.12-1.16 and 2.23-2.24, read with the project's corre
 ``x = f/z (X, Y)``, and every entry of K applies.
 """
 
+import numba
 import numpy as np
 
 from pipeline.records import BoolArray, CameraModel, FloatArray
@@ -167,41 +168,74 @@ def _newton(camera: CameraModel, pixels_vu: FloatArray, start_mm: FloatArray) ->
     scale = np.abs(np.linalg.inv(camera.k_px_per_mm)).max()
     photo = np.where(np.isfinite(start_mm), start_mm, 0.0)
     limit = _MAX_PHOTO_RADIUS_FACTOR * scale * max(camera.shape_vu) + np.abs(photo).max(initial=0.0)
-    residual = np.full_like(photo, np.inf)
-    for _ in range(_MAX_NEWTON_STEPS):
-        distorted = distort(camera, photo)
-        residual = pixels_vu - _pixel_from_photo(camera, distorted)
-        worst = np.abs(residual).max(axis=1)
-        if not (worst > UNPROJECT_TOLERANCE_PX / 10).any():
-            break
-        step = _solve_2x2(_pixel_jacobian(camera, distorted) @ distort_jacobian(camera, photo), residual, scale)
-        photo = np.clip(photo + step, -limit, limit)
-    converged = (np.abs(residual) <= UNPROJECT_TOLERANCE_PX).all(axis=1)
-    return photo, np.asarray(converged & _before_fold(camera, photo))
+    constants = np.concatenate([camera.distortion_eps, camera.k_px_per_mm.ravel(), camera.k_xy_px_per_mm2])
+    target_uv = np.ascontiguousarray((pixels_vu - camera.principal_point_vu)[:, ::-1])
+    ok = _invert(photo, target_uv, constants, limit, 1e-12 / scale**2)
+    return photo, np.asarray(ok & _before_fold(photo, constants, camera.handedness))
 
 
-def _before_fold(camera: CameraModel, photo_mm: FloatArray) -> BoolArray:
+@numba.njit(cache=True, nogil=True)
+def _forward(x, y, c):  # type: ignore[no-untyped-def]
+    """(u, v) from the principal point and d(u, v)/d(x, y), row by row, of one photo-plane point.
+
+    The formulae of :func:`distort` and :func:`distort_jacobian`; constants are epsilon 1-6, K by rows, (Kxxy, Kyxy).
+    """
+    r2 = x * x + y * y
+    r = np.sqrt(r2)
+    scale = 1.0 + c[0] * r2 + c[1] * r2 * r2 + c[2] * y + c[3] * x
+    swirl = c[4] * r + c[5] * r2 * r
+    radial = 2.0 * c[0] + 4.0 * c[1] * r2
+    turning = (c[4] / r if r > 0.0 else 0.0) + 3.0 * c[5] * r
+    scale_x, scale_y = radial * x + c[3], radial * y + c[2]
+    swirl_x, swirl_y = turning * x, turning * y
+    dx, dy = scale * x - swirl * y, scale * y + swirl * x
+    dxx, dxy = scale + x * scale_x - y * swirl_x, x * scale_y - y * swirl_y - swirl
+    dyx, dyy = y * scale_x + x * swirl_x + swirl, scale + y * scale_y + x * swirl_y
+    kxx, kxy = c[6] + c[10] * dy, c[7] + c[10] * dx
+    kyx, kyy = c[8] + c[11] * dy, c[9] + c[11] * dx
+    u, v = c[6] * dx + c[7] * dy + c[10] * dx * dy, c[8] * dx + c[9] * dy + c[11] * dx * dy
+    return u, v, kxx * dxx + kxy * dyx, kxx * dxy + kxy * dyy, kyx * dxx + kyy * dyx, kyx * dxy + kyy * dyy
+
+
+@numba.njit(cache=True, nogil=True)
+def _invert(photo, target, constants, limit, singular):  # type: ignore[no-untyped-def]
+    """Newton's method from the start in ``photo``, which is overwritten; flags where it has settled."""
+    ok = np.zeros(len(photo), dtype=np.bool_)
+    for i in range(len(photo)):
+        x, y = photo[i, 0], photo[i, 1]
+        worst = np.inf
+        for _ in range(_MAX_NEWTON_STEPS):
+            u, v, a, b, c, d = _forward(x, y, constants)
+            du, dv = target[i, 0] - u, target[i, 1] - v
+            if not np.isfinite(du + dv):
+                worst = np.inf
+                break
+            worst = max(abs(du), abs(dv))
+            determinant = a * d - b * c
+            if worst <= UNPROJECT_TOLERANCE_PX / 10 or not abs(determinant) > singular:
+                break
+            x = min(max(x + (d * du - b * dv) / determinant, -limit), limit)
+            y = min(max(y + (a * dv - c * du) / determinant, -limit), limit)
+        photo[i, 0], photo[i, 1] = x, y
+        ok[i] = worst <= UNPROJECT_TOLERANCE_PX
+    return ok
+
+
+@numba.njit(cache=True, nogil=True)
+def _before_fold(photo, constants, handedness):  # type: ignore[no-untyped-def]
     """True where the model is nowhere turned inside out between the optical axis and a point.
 
     Beyond a fold the residual can vanish at a wrong root, also on a branch that a second fold has turned upright again.
     """
-    share = np.linspace(1.0 / _FOLD_SAMPLES, 1.0, _FOLD_SAMPLES)
-    on_the_way = (share[:, None, None] * photo_mm).reshape(-1, 2)
-    jacobian = _pixel_jacobian(camera, distort(camera, on_the_way)) @ distort_jacobian(camera, on_the_way)
-    (a, b), (c, d) = np.moveaxis(jacobian, 0, 2)
-    # Rows are (v, u), columns (x, y): the order alone turns the sign.
-    upright = camera.handedness * (b * c - a * d) > 0
-    return np.asarray(upright.reshape(_FOLD_SAMPLES, -1).all(axis=0))
-
-
-def _solve_2x2(matrix: FloatArray, right: FloatArray, scale: float) -> FloatArray:
-    """Solutions of (n, 2, 2) systems by Cramer's rule; zero where a system is singular or not finite."""
-    (a, b), (c, d) = np.moveaxis(matrix, 0, 2)
-    determinant = a * d - b * c
-    solvable = np.isfinite(right).all(axis=1) & (np.abs(determinant) > 1e-12 / scale**2)
-    divisor = np.where(solvable, determinant, 1.0)
-    step = np.stack([d * right[:, 0] - b * right[:, 1], a * right[:, 1] - c * right[:, 0]], axis=1) / divisor[:, None]
-    return np.asarray(np.where(solvable[:, None], step, 0.0))
+    upright = np.ones(len(photo), dtype=np.bool_)
+    for i in range(len(photo)):
+        for k in range(1, _FOLD_SAMPLES + 1):
+            share = k / _FOLD_SAMPLES
+            _, _, a, b, c, d = _forward(share * photo[i, 0], share * photo[i, 1], constants)
+            if not handedness * (a * d - b * c) > 0.0:
+                upright[i] = False
+                break
+    return upright
 
 
 def unproject_jacobian(camera: CameraModel, pixels_vu: FloatArray) -> FloatArray:

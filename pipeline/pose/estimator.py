@@ -31,7 +31,7 @@ from pipeline.pose.records import (
     ThermalState,
     frame_id_of,
 )
-from pipeline.pose.refine import Fit, covariance_of, refine, with_point_errors
+from pipeline.pose.refine import Fit, covariance_of, refine, squared_distances, with_point_errors
 from pipeline.pose.se3 import SE3Utils
 from pipeline.records import BoolArray, FloatArray
 
@@ -177,15 +177,14 @@ class OpenCVGtsamPoseEstimator:
     def _solve(self, matches: _Matches) -> _Solution:
         usable = matches.plane.ok
         points, xy, covariance, _ = matches.take(usable)
-        sigma = np.sqrt(np.trace(covariance, axis1=1, axis2=2) / 2.0)
+        sigma = np.sqrt((covariance[:, 0, 0] + covariance[:, 1, 1]) / 2.0)
+        middle = float(np.median(sigma)) if len(sigma) else 0.0
         if len(points) >= self.options.ransac.min_inliers:
-            refuse_degenerate(points, xy, float(np.median(sigma)))
+            refuse_degenerate(points, xy, middle)
         # Most scenes need few samples, since what they miss is found by refining; the rest are searched thoroughly.
         for confidence in (self.options.ransac.first_confidence, self.options.ransac.confidence):
             try:
-                return self._attempt(
-                    matches, self._ransac.filter(points, xy, sigma, confidence), float(np.median(sigma))
-                )
+                return self._attempt(matches, self._ransac.filter(points, xy, sigma, confidence), middle)
             except PnpFailureError as failure:
                 last = failure
         raise last
@@ -277,7 +276,8 @@ class OpenCVGtsamPoseEstimator:
         count, usable = int(best.inlier.sum()), int(matches.plane.ok.sum())
         points, xy, covariance, spread = matches.take(best.inlier)
         full = with_point_errors(best.fit.pose, points, best.scale**2 * covariance, spread)
-        area = np.pi * self.options.ransac.gate_sigma**2 * float(np.median(np.sqrt(np.linalg.det(full))))
+        sizes = np.sqrt(full[:, 0, 0] * full[:, 1, 1] - full[:, 0, 1] * full[:, 1, 0])
+        area = np.pi * self.options.ransac.gate_sigma**2 * float(np.median(sizes))
         seen = matches.plane.xy[matches.plane.ok]
         share = area / float(np.prod(np.maximum(np.ptp(seen, axis=0), np.sqrt(area))))
         chance = log10_false_alarms(usable, count, share)
@@ -337,15 +337,9 @@ def curvature(fit: Fit, points_km: FloatArray, xy: FloatArray, covariance: Float
     unit = 1.0 / np.sqrt(np.diag(fit.information))
     values, vectors = np.linalg.eigh(fit.information * np.outer(unit, unit))
     step = 2.0 / np.sqrt(values[0]) * vectors[:, 0] * unit
-    inverse = np.linalg.inv(covariance)
     worst = 0.0
     for sign in (-1.0, 1.0):
-        moved = SE3Utils.corrected(fit.pose, sign * step)
-        camera = moved.to_camera(points_km)
-        if not (camera[:, 2] > 0).all():
-            return np.inf
-        residual = xy - camera[:, :2] / camera[:, 2:]
-        chi2 = float(np.einsum("ni,nij,nj->", residual, inverse, residual))
+        chi2 = float(squared_distances(SE3Utils.corrected(fit.pose, sign * step), points_km, xy, covariance).sum())
         worst = max(worst, abs(chi2 - fit.chi2 - 4.0) / 4.0)
     return worst
 

@@ -57,7 +57,8 @@ def to_plane(camera: CameraModel, pixels_vu: FloatArray, covariance_px2: FloatAr
     ray = np.where(ok[:, None], rays, [0.0, 0.0, 1.0])
     plane = ray / ray[:, 2:]
     px_from_xy = project_jacobian(camera, plane)[:, :, :2]
-    inverse = np.linalg.inv(px_from_xy)
+    (a, b), (c, d) = np.moveaxis(px_from_xy, 0, 2)
+    inverse = np.moveaxis(np.array([[d, -b], [-c, a]]) / (a * d - b * c), 2, 0)
     covariance = inverse @ covariance_px2 @ inverse.transpose(0, 2, 1)
     return PlanePoints(plane[:, :2], covariance, px_from_xy, ok)
 

@@ -9,7 +9,7 @@ from pydantic import Field
 
 from pipeline.options import Options
 from pipeline.pose.records import MatchError, PnpFailure, PnpFailureError, Pose
-from pipeline.pose.refine import plane_residuals, scene_scale
+from pipeline.pose.refine import scene_scale, squared_distances
 from pipeline.records import BoolArray, FloatArray, Record
 
 # OpenCV draws one point beyond the three of its kernel, to choose among the kernel's four answers.
@@ -123,7 +123,7 @@ class RansacFilter:
         # OpenCV works in single precision: the scene is centred and of unit size. Its gate is one for all points, so
         # it is that of the widest; the exact gates follow.
         centre, scale = scene_scale(points_km)
-        gate = o.gate_sigma * o.widen * float(np.percentile(sigma, 90))
+        gate = o.gate_sigma * o.widen * float(np.sort(sigma)[int(0.9 * (len(sigma) - 1))])
         found, turn, shift, index = cv2.solvePnPRansac(
             (points_km - centre) / scale, xy, np.eye(3), None, iterationsCount=o.iterations, reprojectionError=gate,
             confidence=confidence or o.confidence, flags=cv2.SOLVEPNP_AP3P,
@@ -155,8 +155,4 @@ class RansacFilter:
         numpy.ndarray
             (n,) True inside the gate and before the camera.
         """
-        residual = plane_residuals(pose, points_km, xy)
-        ahead: BoolArray = np.asarray(np.isfinite(residual).all(axis=1))
-        safe = np.where(ahead[:, None], residual, 0.0)
-        squared = np.einsum("ni,nij,nj->n", safe, np.linalg.inv(covariance), safe)
-        return np.asarray(ahead & (squared <= self.options.gate_sigma**2))
+        return np.asarray(squared_distances(pose, points_km, xy, covariance) <= self.options.gate_sigma**2)

@@ -138,6 +138,76 @@ def _levenberg(points, xy, white, c, p):  # type: ignore[no-untyped-def]
     return c, p, cost, information
 
 
+@numba.njit(cache=True, nogil=True)
+def _whitening_2x2(covariance):  # type: ignore[no-untyped-def]
+    """Inverse of the lower Cholesky factor of each matrix."""
+    white = np.zeros(covariance.shape)
+    for i in range(len(covariance)):
+        a, b, c = covariance[i, 0, 0], covariance[i, 1, 0], covariance[i, 1, 1]
+        first = np.sqrt(a)
+        second = np.sqrt(c - b * b / a)
+        white[i, 0, 0] = 1.0 / first
+        white[i, 1, 0] = -b / (a * second)
+        white[i, 1, 1] = 1.0 / second
+    return white
+
+
+@numba.njit(cache=True, nogil=True)
+def _squared_distances(points, xy, white, c, p):  # type: ignore[no-untyped-def]
+    """Squared whitened residual of each point, infinite behind the camera."""
+    squared = np.empty(len(points))
+    for i in range(len(points)):
+        squared[i] = _cost(points[i : i + 1], xy[i : i + 1], white[i : i + 1], c, p)
+        if squared[i] >= _BEHIND:
+            squared[i] = np.inf
+    return squared
+
+
+@numba.njit(cache=True, nogil=True)
+def _spread(points, covariance, point_covariance, c, p):  # type: ignore[no-untyped-def]
+    """Covariance on the plane with that of each point projected onto it."""
+    out = covariance.copy()
+    slope = np.zeros((2, 3))
+    for i in range(len(points)):
+        x, y, z = c @ (points[i] - p)
+        if z <= 0.0:
+            continue
+        for k in range(3):
+            slope[0, k] = (c[0, k] - x / z * c[2, k]) / z
+            slope[1, k] = (c[1, k] - y / z * c[2, k]) / z
+        for e in range(2):
+            for f in range(2):
+                for k in range(3):
+                    for m in range(3):
+                        out[i, e, f] += slope[e, k] * point_covariance[i, k, m] * slope[f, m]
+    return out
+
+
+def squared_distances(pose: Pose, points_km: FloatArray, xy: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Squared residuals on the ideal plane over their covariances.
+
+    Parameters
+    ----------
+    pose
+        The pose.
+    points_km
+        (n, 3) body-fixed.
+    xy
+        (n, 2) measured.
+    covariance
+        (n, 2, 2) of the residuals.
+
+    Returns
+    -------
+    numpy.ndarray
+        (n,), infinite for a point behind the camera.
+    """
+    found: FloatArray = _squared_distances(
+        points_km, xy, _whitening_2x2(covariance), pose.camera_from_body, pose.position_km
+    )
+    return found
+
+
 def whitening(covariance: FloatArray) -> FloatArray:
     """Matrices W with ``W S W' = 1``.
 
@@ -199,13 +269,8 @@ def with_point_errors(
     """
     if point_covariance_km2 is None:
         return covariance
-    camera = pose.to_camera(points_km)
-    z = np.where(camera[:, 2] > 0, camera[:, 2], np.inf)[:, None, None]
-    slope = np.zeros((len(camera), 2, 3))
-    slope[:, 0, 0] = slope[:, 1, 1] = 1.0
-    slope[:, :, 2] = -camera[:, :2] / z[:, :, 0]
-    slope = slope / z @ pose.camera_from_body
-    return np.asarray(covariance + slope @ point_covariance_km2 @ slope.transpose(0, 2, 1))
+    spread: FloatArray = _spread(points_km, covariance, point_covariance_km2, pose.camera_from_body, pose.position_km)
+    return spread
 
 
 def refine(pose: Pose, points_km: FloatArray, xy: FloatArray, covariance: FloatArray) -> Fit:
@@ -230,7 +295,7 @@ def refine(pose: Pose, points_km: FloatArray, xy: FloatArray, covariance: FloatA
     # Positions in units of the scene, so that one damping suits both blocks.
     centre, scale = scene_scale(points_km)
     c, p, cost, information = _levenberg(
-        np.ascontiguousarray((points_km - centre) / scale), np.ascontiguousarray(xy), whitening(covariance),
+        np.ascontiguousarray((points_km - centre) / scale), np.ascontiguousarray(xy), _whitening_2x2(covariance),
         np.ascontiguousarray(pose.camera_from_body), (pose.position_km - centre) / scale,
     )  # fmt: skip
     unit = np.array([scale, scale, scale, 1.0, 1.0, 1.0])
