@@ -5,6 +5,7 @@ came with the maps.
 """
 
 import hashlib
+from collections import OrderedDict
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -18,11 +19,13 @@ from numpy.typing import NDArray
 from catalogs.spc_files import RECORD, MapFile, map_of, maplet_of, padding_bytes
 from catalogs.spc_text import LandmarkFile, SpcProblem
 from pipeline.geometry.maplet import Maplet, MapletIndex, vertex_radius_km
+from pipeline.records import FloatArray
 
 STORE = "maplets.zarr"
 # One chunk is one read: 16 maplets of 99 x 99 cells are 600 kB, and a run of neighbours shares them.
 _CHUNK = 16
 _BATCH = 16 * _CHUNK
+_CHUNKS_KEPT = 8
 _NAME_BYTES = 24
 _UNITS = {
     "heights": "cells", "albedo": "1", "landmark": "km", "scale": "km", "covariance": "km2", "radius": "km",
@@ -58,9 +61,31 @@ class MapletCatalog:
     def _starts(self) -> NDArray[np.int64]:
         return np.cumsum([0, *(data.sizes["maplet"] for data in self.groups.values())])
 
-    def _row(self, number: int) -> xr.Dataset:
+    @cached_property
+    def _columns(self) -> list[dict[str, NDArray[np.generic]]]:
+        """Per group what a maplet has beside its height field."""
+        wide = ("heights", "albedo")
+        return [{str(k): v.values for k, v in g.data_vars.items() if k not in wide} for g in self.groups.values()]
+
+    @cached_property
+    def _read(self) -> OrderedDict[tuple[int, int], tuple[FloatArray, FloatArray]]:
+        """Height fields and albedos of the chunks that were read last, by group and chunk."""
+        return OrderedDict()
+
+    def _fields(self, group: int, row: int) -> tuple[FloatArray, FloatArray]:
+        key = group, row // _CHUNK
+        if key not in self._read:
+            part = list(self.groups.values())[group].isel(maplet=slice(key[1] * _CHUNK, (key[1] + 1) * _CHUNK))
+            self._read[key] = part["heights"].values.astype(float), part["albedo"].values.astype(float)
+            if len(self._read) > _CHUNKS_KEPT:
+                self._read.popitem(last=False)
+        heights, albedo = self._read[key]
+        return heights[row % _CHUNK], albedo[row % _CHUNK]
+
+    def _place(self, number: int) -> tuple[int, int]:
+        """Group of a row of the index, and its row there."""
         group = int(np.searchsorted(self._starts, number, side="right")) - 1
-        return list(self.groups.values())[group].isel(maplet=number - int(self._starts[group])).load()
+        return group, number - int(self._starts[group])
 
     def maplet(self, number: int) -> Maplet:
         """Read one maplet.
@@ -75,10 +100,12 @@ class MapletCatalog:
         Maplet
             With its height field.
         """
-        row = self._row(number)
+        group, row = self._place(number)
+        heights, albedo = self._fields(group, row)
+        columns = self._columns[group]
         return Maplet(
-            _text(row["name"].values), row["landmark"].values, row["frame"].values, float(row["scale"]),
-            row["heights"].values, row["albedo"].values, row["covariance"].values,
+            _text(columns["name"][row]), columns["landmark"][row], columns["frame"][row], float(columns["scale"][row]),
+            heights, albedo, columns["covariance"][row],
         )  # fmt: skip
 
     def map_file(self, number: int) -> MapFile:
@@ -94,14 +121,15 @@ class MapletCatalog:
         MapFile
             For writing.
         """
-        row = self._row(number)
+        group, place = self._place(number)
+        row = {key: values[place] for key, values in self._columns[group].items()}
         maplet = self.maplet(number)
         plain = map_of(maplet, float(row["height_step"]))
-        spare = bytes(row["spare"].values.tolist())
-        padding = bytes(row["padding"].values.tolist())[: padding_bytes(maplet.half)]
+        spare = bytes(row["spare"].tolist())
+        padding = bytes(row["padding"].tolist())[: padding_bytes(maplet.half)]
         return MapFile(
-            plain.half, plain.scale_km, row["map_landmark"].values, plain.axes, plain.height_step, plain.steps,
-            plain.albedo_steps, row["sigma_direction"].values, float(row["sigma"]), spare, padding,
+            plain.half, plain.scale_km, row["map_landmark"], plain.axes, plain.height_step, plain.steps,
+            plain.albedo_steps, row["sigma_direction"], float(row["sigma"]), spare, padding,
         )  # fmt: skip
 
 

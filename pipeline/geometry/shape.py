@@ -9,12 +9,14 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
+from scipy.spatial.distance import cdist
 
 from pipeline.errors import ContractError
 from pipeline.records import FloatArray, Record, TriangleMesh
 
 IntArray = NDArray[np.int64]
 ICQ_FACES = 6
+_CORNERS_AT_ONCE = 256
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,9 +54,13 @@ class Shape(Record):
     def diameter_km(self) -> float:
         """Largest distance between two points of the surface: two corners of its convex hull."""
         corners = self.mesh.vertices_km[ConvexHull(self.mesh.vertices_km).vertices]
-        squares = (corners**2).sum(axis=1)
-        largest = (squares[:, None] + squares - 2.0 * corners @ corners.T).max()
-        return float(np.sqrt(largest))
+        from_middle = np.linalg.norm(corners - corners.mean(axis=0), axis=1)
+        start = corners[np.argmax(from_middle)]
+        least = float(np.linalg.norm(corners - start, axis=1).max())
+        # Smooth bodies have tens of thousands of corners, of which few can be an end of the diameter.
+        ends = corners[from_middle >= least - from_middle.max()]
+        parts = np.array_split(ends, max(1, len(ends) // _CORNERS_AT_ONCE))
+        return max(least, *(float(cdist(part, ends).max()) for part in parts))
 
 
 def volume_km3(mesh: TriangleMesh) -> float:
