@@ -10,6 +10,7 @@ from concurrent.futures import ProcessPoolExecutor
 from functools import lru_cache, partial
 from multiprocessing import get_context
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import pandas as pd
@@ -40,21 +41,28 @@ CHUNK = 16
 
 
 @lru_cache(maxsize=1)
-def _ground(cells: int, seed: int) -> Ground:
-    """Return the fine body; workers make their own."""
-    return ground_of(make_asteroid(BODY.radii_km, cells, seed))
+def _ground(store: Path) -> Ground:
+    """Return the fine body that was made once and kept in a folder."""
+    asteroid = Asteroid(np.load(store / "radius.npy"), np.load(store / "albedo.npy"), *np.load(store / "bounds.npy"))
+    return ground_of(asteroid)
 
 
-def write_shot(item: AsteroidShot, options: AsteroidOptions, folder: Path) -> Json:
+def _keep(asteroid: Asteroid, store: Path) -> None:
+    np.save(store / "radius.npy", asteroid.radius_km)
+    np.save(store / "albedo.npy", asteroid.albedo)
+    np.save(store / "bounds.npy", [asteroid.highest_km, asteroid.steepness])
+
+
+def write_shot(item: AsteroidShot, store: Path, folder: Path) -> Json:
     """Render a frame and write it into a folder; returns its entry of the truth."""
-    ground = _ground(options.cells, options.seed)
+    ground = _ground(store)
     taken, snr = expose(item, ground)
     write_product(item.shot, taken, folder)
     return truth_entry(item, ground, snr)
 
 
-def _write_cut(task: tuple[int, int, FloatArray], options: AsteroidOptions, folder: Path) -> SampleMaplet:
-    maplet = make_maplet(_ground(options.cells, options.seed), options, *task)
+def _write_cut(task: tuple[int, int, FloatArray], options: AsteroidOptions, store: Path, folder: Path) -> SampleMaplet:
+    maplet = make_maplet(_ground(store), options, *task)
     write_maplet(maplet, folder)
     return maplet
 
@@ -133,14 +141,17 @@ def make_asteroid_sample(directory: Path, options: AsteroidOptions) -> Path:
     """
     options.check()
     refuse_used(directory)
-    ground, coarse = _ground(options.cells, options.seed), _coarse(options)
+    fine = make_asteroid(BODY.radii_km, options.cells, options.seed)
+    ground, coarse = ground_of(fine), _coarse(options)
     shots = [plan_frame(index, options, ground) for index in range(options.frames)]
     for name in ("data", "kernels", f"{SPC}/MAPFILES", f"{SPC}/LMKFILES", f"{SPC}/SUMFILES"):
         (directory / name).mkdir(parents=True)
     write_kernels(directory / "kernels", [item.told for item in shots])
     write_coarse_shape(directory / SHAPE, coarse)
     cuts = [(s, *cut) for s in range(len(options.scales_km)) for cut in wanted(ground, shots, options, s)]
-    entries, maplets = _write_all(shots, cuts, directory, options)
+    with TemporaryDirectory() as store:
+        _keep(fine, Path(store))
+        entries, maplets = _write_all(shots, cuts, (directory, Path(store)), options)
     landmark_table(maplets).to_parquet(directory / TRUTH_LANDMARKS, index=False)
     frames: Json = {item.shot.image_id: entry for item, entry in zip(shots, entries, strict=True)}
     truth: Json = {"convention": CONVENTION, "frames": frames}
@@ -153,11 +164,15 @@ def make_asteroid_sample(directory: Path, options: AsteroidOptions) -> Path:
 
 
 def _write_all(
-    shots: list[AsteroidShot], cuts: list[tuple[int, int, FloatArray]], directory: Path, options: AsteroidOptions
+    shots: list[AsteroidShot],
+    cuts: list[tuple[int, int, FloatArray]],
+    folders: tuple[Path, Path],
+    options: AsteroidOptions,
 ) -> tuple[list[Json], list[SampleMaplet]]:
     """Write all frames and maplets; returns their truth in order."""
-    draw = partial(write_shot, options=options, folder=directory / "data")
-    cut = partial(_write_cut, options=options, folder=directory / SPC)
+    directory, store = folders
+    draw = partial(write_shot, store=store, folder=directory / "data")
+    cut = partial(_write_cut, options=options, store=store, folder=directory / SPC)
     if options.processes == 1:
         return [draw(item) for item in shots], [cut(task) for task in cuts]
     # Forking a program that may run threads is not safe.
