@@ -1,7 +1,6 @@
 """The command ``pilotage``."""
 
 import contextlib
-import logging
 import signal
 import sys
 import time
@@ -42,6 +41,7 @@ from workflows.report import (
     read_truth,
 )
 from workflows.run import EXIT_INTERRUPTED, EXIT_NOT_STARTED, RunListener, execute, exit_code
+from workflows.run_log import LogFormat, logged_to, terminal
 from workflows.store import RunFolder, read_json, refuse_foreign, write_atomically
 from workflows.task import Outcome
 
@@ -59,7 +59,7 @@ app.command()(doctor_cli.doctor)
 app.command()(validate_cli.validate)
 app.command()(status_cli.status)
 
-_LOG = logging.getLogger("pilotage")
+_SILENT = RunListener(lambda workers: None, lambda outcome: None)
 _LOG_EVERY_S = 5.0
 _LOG_WIDTH = 130
 
@@ -107,7 +107,10 @@ def run(
     config: ConfigOption = [],  # noqa: B006
     settings: SetOption = [],  # noqa: B006
     verify: VerifyOption = False,
-    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Log each technique's rotation.")] = False,
+    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Say each technique's rotation.")] = False,
+    log_format: Annotated[LogFormat, typer.Option(help="text, or all of RUN/log.jsonl as it is written.")] = (
+        LogFormat.TEXT
+    ),
     pictures: Annotated[str, typer.Option(help="RUN/pictures of: all, failed, sample:N, none.")] = "none",
     tell: Annotated[str | None, typer.Option("--notify", help="Command that gets run.json as its input.")] = None,
 ) -> None:
@@ -117,9 +120,6 @@ def run(
     """
     if serial and scheduler:
         raise ConfigurationError("--serial and --scheduler exclude each other")
-    if verbose:
-        logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(message)s")
-        _LOG.setLevel(logging.INFO)
     folder = RunFolder(output)
     # The death of a worker closes a socket under our hands, which is no reason to end.
     signal.signal(signal.SIGPIPE, signal.SIG_IGN)
@@ -132,13 +132,17 @@ def run(
     opened, configuration = open_both(archive, config, settings)
     work = make_plan(opened, configuration, folder, verify)
     options = ClusterOptions(0 if serial else workers, scheduler, memory_limit)
-    console = Console(stderr=True)
-    with _follow(console, work) as listener:
-        statuses = execute(work, options, listener)
-    if pictures != "none":
-        draw_all(opened, folder, chosen(folder, ids_of(work.every), pictures))
-    if tell is not None:
-        notify(tell, folder)
+    as_json = log_format is LogFormat.JSON
+    console = Console(stderr=True, quiet=as_json)
+    with terminal(log_format, verbose):
+        with contextlib.ExitStack() as shown:
+            listener = _SILENT if as_json else shown.enter_context(_follow(console, work))
+            statuses = execute(work, options, listener)
+        with logged_to(output):
+            if pictures != "none":
+                draw_all(opened, folder, chosen(folder, ids_of(work.every), pictures))
+            if tell is not None:
+                notify(tell, folder)
     counts = ", ".join(f"{count} {status}" for status, count in sorted(statuses.items()))
     console.print(
         f"{len(work.every)} images: {counts}. Tables and images/*.json in {output}",
@@ -155,8 +159,6 @@ def _follow(console: Console, work: Plan):  # type: ignore[no-untyped-def]
 
     def count(outcome: Outcome) -> None:
         counts[outcome.status] += 1
-        for note in outcome.notes:
-            _LOG.info(note)
 
     def line() -> str:
         done = sum(counts.values())

@@ -3,7 +3,7 @@
 import logging
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from uuid import uuid4
 
@@ -16,6 +16,7 @@ from catalogs.archive import ImageRef
 from pipeline.errors import ConfigurationError, PilotageError
 from pipeline.status import Status, StatusReason
 from workflows.plan import Plan, Setup
+from workflows.run_log import kept_lines
 from workflows.store import to_json, write_atomically
 from workflows.task import ImageRunner, Outcome, lost_document
 
@@ -61,13 +62,16 @@ class RunnerPlugin(WorkerPlugin):  # type: ignore[misc]
 
     def setup(self, worker: Worker) -> None:
         """Called by Dask on each worker."""
+        # Python's own warnings then go where all lines of a worker go: into the log of the run.
+        logging.captureWarnings(True)
         self.runner = ImageRunner(self._setup)
 
 
 def _on_worker(ref: ImageRef, plugin_name: str) -> Outcome:
     plugin = get_worker().plugins[plugin_name]
-    outcome: Outcome = plugin.runner.run(ref)
-    return outcome
+    with kept_lines() as lines:
+        outcome: Outcome = plugin.runner.run(ref)
+    return replace(outcome, lines=tuple(lines))
 
 
 @contextmanager

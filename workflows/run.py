@@ -2,17 +2,22 @@
 
 import hashlib
 import json
+import logging
 import platform
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib.metadata import version
+from pathlib import Path
 
 from pipeline.curate import Json
+from pipeline.errors import PilotageError
 from pipeline.status import Status
 from workflows.execute import ClusterOptions, open_workers
 from workflows.plan import Plan, ids_of
+from workflows.run_log import logged_to, say
 from workflows.store import RunFolder, exclusive, read_json, sweep, to_json, write_atomically, write_tables
 from workflows.task import Outcome
 
@@ -69,13 +74,58 @@ def execute(plan: Plan, options: ClusterOptions, listener: RunListener) -> Count
         digest = hashlib.sha256(json.dumps(ids).encode() + plan.setup.configuration.digest().encode()).hexdigest()
         (folder.root / "run.json").unlink(missing_ok=True)
         write_atomically(folder.plan, to_json({"images": list(ids), "digest": digest}))
-        run_images(listener.on_done, listener.on_ready)
-        # A worker may die while it writes.
-        sweep(folder)
-        write_tables(folder, ids)
-        statuses = _statuses(folder, ids)
-        write_atomically(folder.root / "run.json", to_json(_summary(plan, started, statuses, digest)))
+        with logged_to(folder.root), _told_start_and_end(plan, digest):
+            run_images(*_logging(listener))
+            # A worker may die while it writes.
+            sweep(folder)
+            write_tables(folder, ids)
+            statuses = _statuses(folder, ids)
+            write_atomically(folder.root / "run.json", to_json(_summary(plan, started, statuses, digest)))
+            counts: dict[str, Json] = dict(sorted(statuses.items()))
+            said = ", ".join(f"{count} {status}" for status, count in counts.items())
+            say("end", f"finished: {said}", statuses=counts)
     return statuses
+
+
+@contextmanager
+def _told_start_and_end(plan: Plan, digest: str) -> Iterator[None]:
+    """Log the start, and whatever but a kill ends the run before its time."""
+    count, todo = len(plan.every), len(plan.todo)
+    say(
+        "start", f"{count} images, {count - todo} answered before, {todo} to do", images=count, to_do=todo,
+        archive=plan.setup.archive.url, software=plan.setup.software, plan_digest=digest,
+        config_digest=plan.setup.configuration.digest(),
+    )  # fmt: skip
+    try:
+        yield
+    except KeyboardInterrupt:
+        say("interrupted", "interrupted", logging.WARNING)
+        raise
+    except PilotageError as error:
+        say("stopped", str(error), logging.ERROR)
+        raise
+
+
+def _logging(listener: RunListener) -> tuple[Callable[[Outcome], None], Callable[[str], None]]:
+    """A listener's functions, each call logged too."""
+
+    def on_done(outcome: Outcome) -> None:
+        bad = outcome.status == Status.ERROR.value
+        say(
+            "image", f"{outcome.image_id} {outcome.status} {outcome.reason}", logging.WARNING if bad else logging.INFO,
+            image_id=outcome.image_id, status=outcome.status, reason=outcome.reason, seconds=round(outcome.seconds, 6),
+        )  # fmt: skip
+        for line in outcome.lines:
+            say("line", line.text, line.level, image_id=outcome.image_id, logger=line.logger)
+        for note in outcome.notes:
+            say("note", note, image_id=outcome.image_id)
+        listener.on_done(outcome)
+
+    def on_ready(workers: str) -> None:
+        say("workers", workers)
+        listener.on_ready(workers)
+
+    return on_done, on_ready
 
 
 def _statuses(folder: RunFolder, ids: list[str]) -> Counter[str]:
@@ -86,7 +136,8 @@ def _statuses(folder: RunFolder, ids: list[str]) -> Counter[str]:
 def _summary(plan: Plan, started: datetime, statuses: Counter[str], digest: str) -> dict[str, Json]:
     setup = plan.setup
     return {
-        "schema": "pilotage-run/1", "archive": setup.archive.description.name, "software": setup.software,
+        "schema": "pilotage-run/1", "archive": setup.archive.description.name,
+        "archive_url": absolute(setup.archive.url), "software": setup.software,
         "python": platform.python_version(), "libraries": {name: version(name) for name in _LIBRARIES},
         "config_digest": setup.configuration.digest(), "configuration": setup.configuration.model_dump(mode="json"),
         "archive_description": setup.archive.description.model_dump(mode="json"),
@@ -95,6 +146,22 @@ def _summary(plan: Plan, started: datetime, statuses: Counter[str], digest: str)
         "plan_digest": digest, "started_utc": started.isoformat(timespec="seconds"),
         "finished_utc": datetime.now(UTC).isoformat(timespec="seconds"),
     }  # fmt: skip
+
+
+def absolute(url: str) -> str:
+    """An archive's address that holds from any folder.
+
+    Parameters
+    ----------
+    url
+        Folder, maybe relative, or URL.
+
+    Returns
+    -------
+    str
+        The same, from the root where it is a folder.
+    """
+    return url if "://" in url else str(Path(url).resolve())
 
 
 def exit_code(statuses: Counter[str]) -> int:

@@ -35,6 +35,7 @@ from pipeline.records import BoolArray, StarTable, State, TriangleMesh
 from pipeline.status import StatusReason
 from workflows.maplet_sources import Maplets
 from workflows.plan import Setup
+from workflows.run_log import Line
 from workflows.store import to_json, write_atomically
 
 # What a bug in the science can raise. Trouble with the output (OSError) is not among them: a full disk stops the run.
@@ -49,13 +50,17 @@ _Made = TypeVar("_Made")
 
 @dataclass(frozen=True)
 class Outcome:
-    """What the main process needs to know of a finished image; ``notes`` are lines for its log, at INFO."""
+    """What the main process needs to know of a finished image.
+
+    ``notes`` are lines for its log, at INFO; ``lines`` what a worker process logged meanwhile.
+    """
 
     image_id: str
     status: str
     reason: str
     seconds: float
     notes: tuple[str, ...] = ()
+    lines: tuple[Line, ...] = ()
 
 
 class Stopwatch:
