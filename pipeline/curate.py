@@ -16,9 +16,9 @@ from pipeline.predict.rings import RingFate
 from pipeline.records import FloatArray, State
 from pipeline.status import Rank, Status, StatusReason, status_of
 from pipeline.techniques.base import FeatureTable, TechniqueFailure, TechniqueResult, covariance_of
-from pipeline.techniques.landmark_state import LandmarkState
 from pipeline.techniques.landmark_table import LandmarkTable
 from pipeline.techniques.ring_edges import RingEdgeTable
+from pipeline.techniques.surface_features import SurfaceFix
 
 Json = str | int | float | bool | None | list["Json"] | dict[str, "Json"]
 
@@ -106,13 +106,13 @@ def build_metadata_dict(
     }  # fmt: skip
     document |= _answer(estimate, state)
     document["pointing"] = _pointing(estimate, state, navigation.reason)
+    document["geometry"] = _geometry(state)
     document["bodies"] = [_body(fate) for fate in navigation.bodies]
     document["rings"] = [_ring(fate) for fate in navigation.rings]
     document["ring_edges"] = None if navigation.ring_edges is None else _ring_edges(navigation.ring_edges)
     table = None if navigation.landmarks is None else navigation.landmarks.table
     document["landmarks"] = None if table is None else _landmarks(table)
-    fix = None if navigation.landmarks is None else navigation.landmarks.state
-    document["landmark_state"] = None if fix is None else _landmark_state(fix)
+    document["landmark_state"] = None if navigation.landmarks is None else _landmark_state(navigation.landmarks)
     document["frame"] = None if navigation.frame is None else _frame_figures(navigation.frame)
     answers: list[Json] = [_technique(result, estimate) for result in navigation.results]
     document["techniques"] = [*answers, *(_failure(failure) for failure in navigation.failures)]
@@ -147,9 +147,8 @@ def error_document(
         "schema": SCHEMA, "image_id": image_id, "mission": "UNKNOWN", "camera": "UNKNOWN", "time_utc": None, "et": None,
         "exposure_s": None, "status": status.value, "status_reason": reason.value, "detail": detail,
         "rank": Rank.FAILED.value, "confidence": None, "offset_px": None, "sigma_px": None, "covariance_px2": None,
-        "observable": None, "pointing": None, "bodies": [], "rings": [], "ring_edges": None, "landmarks": None,
-        "landmark_state": None, "frame": None,
-        "techniques": [], "label": label,
+        "observable": None, "pointing": None, "geometry": None, "bodies": [], "rings": [], "ring_edges": None,
+        "landmarks": None, "landmark_state": None, "frame": None, "techniques": [], "label": label,
         "provenance": _provenance(provenance),
     }  # fmt: skip
 
@@ -219,12 +218,34 @@ def _pointing(estimate: _CombinedEstimate | None, state: State, reason: StatusRe
     prior = state.attitude.camera_from_j2000
     pointing: dict[str, Json] = {
         "a_priori_camera_from_j2000_wxyz": _numbers(quaternion_from_matrix(prior)),
-        "camera_from_j2000_wxyz": None,
-    }
+        "camera_from_j2000_wxyz": None, "covariance": None,
+    }  # fmt: skip
     if estimate is not None and estimate.observable_vu is None and status_of(reason) is Status.SUCCESS:
         after = corrected_attitude(state.camera_model, prior, estimate.offset_vu, estimate.rotation_rad or 0.0)
         pointing["camera_from_j2000_wxyz"] = _numbers(quaternion_from_matrix(after))
+        known = 2 if estimate.rotation_rad is None else len(estimate.covariance)
+        # (dv, du, theta) at the array centre, px^2 and rad^2; without theta where that is not known.
+        pointing["covariance"] = _numbers(estimate.covariance[:known, :known])
     return pointing
+
+
+def _geometry(state: State) -> dict[str, Json]:
+    """The camera, and from where it was believed to see each body: what poses are estimated against."""
+    camera = state.camera_model
+    model: dict[str, Json] = {
+        "shape_vu": list(camera.shape_vu), "focal_length_mm": camera.focal_length_mm,
+        "k_px_per_mm": _numbers(camera.k_px_per_mm), "principal_point_vu": _numbers(camera.principal_point_vu),
+        "distortion_eps": _numbers(camera.distortion_eps), "k_xy_px_per_mm2": _numbers(camera.k_xy_px_per_mm2),
+    }  # fmt: skip
+    bodies: list[Json] = [
+        {
+            "name": body.name, "naif_id": body.naif_id, "radii_km": _numbers(body.radii_km),
+            "camera_in_body_km": _numbers(-body.body_from_j2000 @ body.position_km),
+            "body_from_j2000_wxyz": _numbers(quaternion_from_matrix(body.body_from_j2000)),
+        }
+        for body in state.bodies
+    ]  # fmt: skip
+    return {"camera_model": model, "bodies": bodies}
 
 
 def _frame_figures(frame: Frame) -> dict[str, Json]:
@@ -281,12 +302,18 @@ def _landmarks(table: LandmarkTable) -> dict[str, Json]:
         columns[name] = _numbers(values, _PIXEL_DIGITS + 1)
     for axis, name in enumerate(("x_km", "y_km", "z_km")):
         columns[name] = _numbers(table.landmark_km[:, axis])
+    for i, j in zip(*np.triu_indices(3), strict=True):
+        columns[f"cov_{'xyz'[i]}{'xyz'[j]}_km2"] = _numbers(table.landmark_covariance_km2[:, i, j])
     return columns
 
 
-def _landmark_state(state: LandmarkState) -> dict[str, Json]:
+def _landmark_state(fix: SurfaceFix) -> dict[str, Json] | None:
     """Body-fixed place of the camera; covariance order (x, y, z, rx, ry, rz), km and rad."""
+    state = fix.state
+    if state is None or isinstance(fix.answer, TechniqueFailure):
+        return None
     return {
+        "body": fix.answer.error_sources[0].removeprefix("body:"),
         "position_km": _numbers(state.view.position_km),
         "camera_from_body_wxyz": _numbers(quaternion_from_matrix(state.view.camera_from_body)),
         "covariance": _numbers(state.covariance), "landmarks_used": int(state.used.sum()),

@@ -5,6 +5,8 @@ from collections.abc import Iterable, Mapping
 import pyarrow as pa
 
 from pipeline.curate import Json
+from pipeline.pose.records import frame_id_of
+from pipeline.pose.schemas import ARC_SCHEMA, POSE_SCHEMA, UPPER
 
 Row = dict[str, Json]
 
@@ -132,11 +134,16 @@ SCHEMAS: dict[str, pa.Schema] = {
         _field("x_km", _REAL, "km", "landmark, body-fixed"),
         _field("y_km", _REAL, "km", "landmark, body-fixed"),
         _field("z_km", _REAL, "km", "landmark, body-fixed"),
+        *[_field(f"cov_{a}{b}_km2", _REAL, "km2", f"covariance of its {a} and {b}")
+          for a, b in ("xx", "xy", "xz", "yy", "yz", "zz")],
     ]),
+    "poses": POSE_SCHEMA,
+    "arcs": ARC_SCHEMA,
     "timings": pa.schema([
         *_IDENTITY,
         _field("stage", _TEXT, "", "stage of the pipeline, or total"),
         _field("seconds", _REAL, "s", "wall-clock time on its worker"),
+        _field("emitted_at_ns", pa.int64(), "ns", "monotonic clock of the worker when a pose was emitted; else null"),
     ]),
 }  # fmt: skip
 
@@ -244,6 +251,37 @@ def technique_rows(document: Mapping[str, Json]) -> list[Row]:
         row["extra_sigma_px"] = diagnostics.get("extra_sigma_px") if isinstance(diagnostics, dict) else None
         rows.append(row)
     return rows
+
+
+def landmark_pose_row(document: Mapping[str, Json]) -> Row | None:
+    """Row of table ``poses``: what an image's own landmarks say, before arcs are smoothed.
+
+    Parameters
+    ----------
+    document
+        An image's JSON document.
+
+    Returns
+    -------
+    dict or None
+        One value for each column that is known; None for an image without a pose of its own.
+    """
+    state = document.get("landmark_state")
+    if not isinstance(state, dict):
+        return None
+    place, turn, covariance = state["position_km"], state["camera_from_body_wxyz"], state["covariance"]
+    assert isinstance(place, list)
+    assert isinstance(turn, list)
+    assert isinstance(covariance, list)
+    row = _identity(document)
+    row |= {
+        "frame_id": str(frame_id_of(str(document["image_id"]))), "et": document["et"], "body": state["body"],
+        "label": "satellite_anchored", "last_satellite_anchor_age_ms": 0, "covariance_mode": "marginals",
+        "method": "landmark_state", "matches_used": state["landmarks_used"], "outlier": False,
+    }  # fmt: skip
+    row |= {f"raw_{axis}_km": place[k] for k, axis in enumerate("xyz")}
+    row |= {f"raw_q{part}": turn[k] for k, part in enumerate("wxyz")}
+    return row | {f"raw_cov_{i}{j}": covariance[i][j] for i, j in UPPER}  # type: ignore[index]
 
 
 def feature_columns(documents: Iterable[Mapping[str, Json]]) -> dict[str, list[Json]]:

@@ -30,7 +30,7 @@ FOUNDATIONS = {
     "geometry": ("rotations", "shape", "rays", "maplet"),
     "imaging": ("psf", "illumination", "render"),
     "pose": (
-        "records", "se3", "normalise", "refine", "pnp", "ransac", "graph",
+        "records", "schemas", "se3", "normalise", "refine", "pnp", "ransac", "graph",
         "estimator", "triangulation", "views", "bundle", "arc_factors", "arcs",
     ),
     "predict": ("body_view", "bodies", "maplets"),

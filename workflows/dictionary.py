@@ -9,7 +9,6 @@ import pyarrow as pa
 
 from pipeline.status import StatusReason, status_of
 from pipeline.tables import SCHEMAS
-from workflows.pose_arcs import ARC_SCHEMA, POSE_SCHEMA
 
 TARGET = Path("outputs/README.md")
 
@@ -36,13 +35,9 @@ _TABLES = {
     "features": "One row per predicted feature, technique and image.",
     "ring_edges": "One row per measured piece of a ring's edge and image, some 24 pixels long.",
     "landmarks": "One row per landmark looked for and image.",
+    "poses": "One row per image with a pose of its own, after `pilotage pose` per image of an arc, smoothed.",
+    "arcs": "One row per arc, written by `pilotage pose`.",
     "timings": "One row per stage and image, and one for the total.",
-}
-
-
-_POSE_TABLES = {
-    "poses": "Of `pilotage pose --arcs`: one row per image of an arc, its smoothed pose and the one it had alone.",
-    "arcs": "Of `pilotage pose --arcs`: one row per arc.",
 }
 
 
@@ -67,8 +62,6 @@ def data_dictionary() -> str:
     parts = [_HEAD]
     for name, schema in SCHEMAS.items():
         _describe(parts, name, f"{_TABLES[name]} Partition columns (`mission`, `camera`) live in the path.", schema)
-    for name, schema in (("poses", POSE_SCHEMA), ("arcs", ARC_SCHEMA)):
-        _describe(parts, name, _POSE_TABLES[name], schema)
     parts.append("## Status and reason\n\n| status | reasons |\n|---|---|\n")
     for status in dict.fromkeys(status_of(reason) for reason in StatusReason):
         reasons = ", ".join(f"`{reason.value}`" for reason in StatusReason if status_of(reason) is status)

@@ -26,6 +26,7 @@ from pipeline.pose.records import (
     SourceLabel,
     ThermalState,
 )
+from pipeline.pose.schemas import UPPER
 from pipeline.pose.se3 import SE3Utils
 from pipeline.pose.triangulation import Intersections
 from pipeline.pose.views import (
@@ -39,7 +40,6 @@ from pipeline.pose.views import (
 )
 from pipeline.records import FloatArray
 
-UPPER = tuple((i, j) for i in range(6) for j in range(i, 6))
 _FRAME = (
     "x_cam = camera_from_body (X - position), quaternion of camera_from_body scalar first; cov: upper triangle by rows "
     "of the errors (x, y, z, rx, ry, rz), km and rad, body-fixed, position estimated minus true and "

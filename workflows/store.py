@@ -24,6 +24,7 @@ from pipeline.tables import (
     VERSION_KEY,
     block_columns,
     feature_columns,
+    landmark_pose_row,
     offset_row,
     technique_rows,
 )
@@ -225,6 +226,33 @@ def read_json(path: Path) -> dict[str, Json] | None:
     return content if isinstance(content, dict) else None
 
 
+def document_of(folder: RunFolder, image_id: str) -> dict[str, Json]:
+    """Document of one image.
+
+    Parameters
+    ----------
+    folder
+        The run.
+    image_id
+        The image.
+
+    Returns
+    -------
+    dict
+        JSON values.
+
+    Raises
+    ------
+    ConfigurationError
+        If the run has no such image.
+    """
+    document = read_json(folder.document(image_id))
+    # The name of any other file beside the documents is no image either.
+    if document is None or document.get("image_id") != image_id:
+        raise ConfigurationError(f"{folder.root} has no image {image_id}")
+    return document
+
+
 def write_tables(folder: RunFolder, image_ids: Sequence[str]) -> None:
     """Rebuild all tables from the images' documents, in the order of the ids.
 
@@ -255,7 +283,8 @@ def _write_partition(folder: RunFolder, table: str, mission: str, camera: str, i
     """One Parquet file; mission and camera live in its path, as hive partitions do."""
     names = [name for name in SCHEMAS[table].names if name not in ("mission", "camera")]
     version = {VERSION_KEY: str(SCHEMA_VERSION).encode()}
-    schema = pa.schema([SCHEMAS[table].field(name) for name in names], metadata=version)
+    metadata = version | (SCHEMAS[table].metadata or {})
+    schema = pa.schema([SCHEMAS[table].field(name) for name in names], metadata=metadata)
     target = folder.root / table / _partition(mission, camera) / f"{table}.parquet"
     target.parent.mkdir(parents=True, exist_ok=True)
     temporary = target.with_name(f".{target.name}.{uuid4().hex}")
@@ -275,6 +304,11 @@ def _columns(folder: RunFolder, table: str, image_ids: Iterable[str]) -> dict[st
         return block_columns(documents, table)
     if table == "offsets":
         rows = [offset_row(document) for document in documents]
+    elif table == "poses":
+        # Arcs are not the images': `pilotage pose` smooths them afterwards.
+        rows = [row for row in map(landmark_pose_row, documents) if row is not None]
+    elif table == "arcs":
+        rows = []
     elif table == "techniques":
         rows = [row for document in documents for row in technique_rows(document)]
     else:

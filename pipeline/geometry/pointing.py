@@ -6,6 +6,9 @@ from pipeline.camera import project, unproject
 from pipeline.geometry.rotations import plane_rotation, plane_rotation_derivative, rotation_about, smallest_rotation
 from pipeline.records import CameraModel, FloatArray
 
+# Pixels, pixels and radians by which a derivative is taken on either side.
+_STEPS = (0.25, 0.25, 1e-4)
+
 
 def corrected_attitude(
     camera: CameraModel, camera_from_j2000: FloatArray, offset_vu: FloatArray, rotation_rad: float = 0.0
@@ -36,6 +39,44 @@ def corrected_attitude(
     twist = rotation_about(end, camera.handedness * rotation_rad)
     result: FloatArray = twist @ smallest_rotation(start, end) @ camera_from_j2000
     return result
+
+
+def attitude_information(
+    camera: CameraModel, offset_vu: FloatArray, rotation_rad: float, covariance: FloatArray
+) -> FloatArray:
+    """Information that an offset brings about the attitude of :func:`corrected_attitude`.
+
+    Parameters
+    ----------
+    camera
+        The model.
+    offset_vu
+        (2,) offset at the array centre, pixels.
+    rotation_rad
+        In-plane rotation, zero where it is not known.
+    covariance
+        (3, 3) of (dv, du, theta), px^2 and rad^2; or (2, 2), then nothing is known of the rotation.
+
+    Returns
+    -------
+    numpy.ndarray
+        (3, 3) per rad^2, of the rotation between the true attitude and this one, camera axes; exactly singular along
+        what is not known.
+    """
+    columns = []
+    for axis, step in enumerate(_STEPS):
+        move = np.zeros(3)
+        move[axis] = step
+        ends = [
+            corrected_attitude(camera, np.eye(3), offset_vu + way * move[:2], rotation_rad + way * move[2])
+            for way in (1.0, -1.0)
+        ]
+        change = ends[0] @ ends[1].T
+        turn = [change[2, 1] - change[1, 2], change[0, 2] - change[2, 0], change[1, 0] - change[0, 1]]
+        columns.append(np.array(turn) / (4.0 * step))
+    inverse = np.linalg.inv(np.stack(columns, axis=1))
+    size = len(covariance)
+    return np.asarray(inverse[:size].T @ np.linalg.inv(covariance) @ inverse[:size])
 
 
 def offset_between(camera: CameraModel, before: FloatArray, after: FloatArray) -> tuple[FloatArray, float]:

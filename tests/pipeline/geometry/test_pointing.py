@@ -8,7 +8,7 @@ from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 from pipeline.camera import project, unproject
-from pipeline.geometry.pointing import corrected_attitude, move_pivot, offset_between
+from pipeline.geometry.pointing import attitude_information, corrected_attitude, move_pivot, offset_between
 from pipeline.geometry.rotations import plane_rotation
 from pipeline.records import CameraModel, FloatArray
 
@@ -109,3 +109,25 @@ def test_a_moved_covariance_is_the_monte_carlos() -> None:
     # Correlations from 4000 draws: 1/sqrt(4000) = 0.016 each.
     assert_allclose(np.cov(moved.T) / np.outer(scale, scale),
                     np.linalg.inv(information) / np.outer(scale, scale), atol=0.09)  # fmt: skip
+
+
+@every_camera
+def test_information_about_an_attitude_is_that_of_its_offsets(camera: CameraModel) -> None:
+    rng = np.random.default_rng(5)
+    offset, theta = np.array([14.0, -9.0]), 0.01
+    factor = rng.normal(size=(3, 3)) * np.array([0.4, 0.4, 2e-3])[:, None]
+    covariance = factor @ factor.T
+    middle = corrected_attitude(camera, PRIOR, offset, theta)
+    turns = []
+    for error in rng.multivariate_normal(np.zeros(3), covariance, 3000):
+        moved = corrected_attitude(camera, PRIOR, offset + error[:2], theta + error[2])
+        turns.append(Rotation.from_matrix(moved @ middle.T).as_rotvec())
+    # White in the information's own measure: unit variances, nothing in common, within the sample's scatter.
+    root = np.linalg.cholesky(attitude_information(camera, offset, theta, covariance))
+    assert_allclose(np.cov((np.array(turns) @ root).T), np.eye(3), atol=0.1)
+    blind = attitude_information(camera, offset, theta, covariance[:2, :2])
+    values, vectors = np.linalg.eigh(blind)
+    assert abs(values[0]) < 1e-9 * values[1]
+    # What is not known is the turn about the direction that the array's centre sees.
+    sight = unproject(camera, camera.centre_vu[None] + offset)[0][0]
+    assert abs(vectors[:, 0] @ sight) > 1 - 1e-9
