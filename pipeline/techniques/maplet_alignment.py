@@ -1,11 +1,13 @@
 """One coarse shift and twist for all maplets of a picture, so that each of them then needs a small search only.
 
 The predicted light of all maplets is laid over the picture as one masked template and correlated with it at every
-offset within the margin, for some twists; on reduced pixels where the picture is large.
+offset within the margin, for some twists; on reduced pixels where the picture is large. Both are first freed of local
+level and contrast: the broad shading of a round body looks alike at many offsets, its relief at one.
 """
 
 from dataclasses import dataclass
 
+import cv2
 import numba
 import numpy as np
 
@@ -16,9 +18,13 @@ from pipeline.imaging.ncc import Level, make_level, ncc_map, peak_of
 from pipeline.records import BoolArray, FloatArray, Image, Record
 
 # Reduced pixels along the template's longer side, at most.
-_LONGEST = 360
+_LONGEST = 480
 # A twist between two samples moves the template's far end by less than twice this, in reduced pixels.
-_TWIST_STEP_PX = 1.5
+_TWIST_STEP_PX = 1.0
+# Side of the window of local level and contrast in reduced pixels, and the share of the whole's contrast below which a
+# window's does not count.
+_LOCAL_PX = 21
+_LEAST_CONTRAST = 0.1
 _MOST_TWISTS = 41
 _CELLS_IN_PIXEL = 3.0
 
@@ -130,7 +136,7 @@ def align(
     size = np.minimum(high - low, np.array(picture[0].shape) + 2.0 * np.array(margin_vu))
     factor = max(1, int(np.ceil((size.max() + 2.0 * max(margin_vu)) / _LONGEST)))
     radius = float(np.linalg.norm(size)) / 2.0 / factor
-    reduced = make_level(*picture, factor)
+    reduced = _flattened(make_level(*picture, factor))
     margins = tuple(int(np.ceil(m / factor)) + 1 for m in margin_vu)
     best: Alignment | None = None
     # A few cells in a reduced pixel tell its mean; odd steps do not fall into the grids' columns.
@@ -138,10 +144,27 @@ def align(
     pixels, light = cells.pixels_vu[::thin] - pivot, cells.light[::thin]
     for twist in _twists(max_rotation_rad, radius):
         template, origin = _template(pixels @ plane_rotation(twist).T, light, pivot, size, factor)
-        found = _search(template, _window(reduced, origin, template.image.shape, margins), margins)
+        found = _search(_flattened(template), _window(reduced, origin, template.image.shape, margins), margins)
         if found is not None and (best is None or found[1] > best.correlation):
             best = Alignment(found[0] * factor, twist, pivot, found[1], factor)
     return best
+
+
+def _flattened(level: Level) -> Level:
+    """Light less its local mean, over its local scatter."""
+    side = (_LOCAL_PX, _LOCAL_PX)
+
+    def local(values: Image) -> Image:
+        summed = cv2.boxFilter(values, cv2.CV_32F, side, normalize=False, borderType=cv2.BORDER_CONSTANT)
+        return np.asarray(summed, np.float32)
+
+    weight = np.maximum(local(level.weight), np.float32(1e-3))
+    known = level.weight > 0
+    rest = np.where(known, level.image - local(level.image * level.weight) / weight, np.float32(0.0))
+    scatter = local(rest * rest * level.weight) / weight
+    floor = _LEAST_CONTRAST**2 * float(scatter[known].mean()) if known.any() else 0.0
+    flat = rest / np.sqrt(scatter + np.float32(max(floor, 1e-30)))
+    return Level(level.factor, np.where(known, flat, np.float32(0.0)), level.weight)
 
 
 def _twists(largest: float, radius: float) -> FloatArray:
@@ -175,18 +198,14 @@ def _gather(places, light, total, number):  # type: ignore[no-untyped-def]
 
 
 def _window(reduced: Level, origin: np.ndarray, shape: tuple[int, ...], margins: tuple[int, ...]) -> Image:
-    """Picture under the template and its margins; what is not known has the picture's mean."""
-    known = reduced.weight > 0
-    mean = np.float32(reduced.image[known].mean()) if known.any() else np.float32(0.0)
-    rows, cols = (shape[k] + 2 * margins[k] for k in range(2))
-    window = np.full((rows, cols), mean, np.float32)
+    """Flattened picture under the template and its margins; zero, the mean, where nothing is known."""
+    window = np.zeros(tuple(shape[k] + 2 * margins[k] for k in range(2)), np.float32)
     start = [int(origin[k]) - margins[k] for k in range(2)]
     low = [max(0, -start[k]) for k in range(2)]
     high = [min(window.shape[k], reduced.image.shape[k] - start[k]) for k in range(2)]
     if high[0] > low[0] and high[1] > low[1]:
         there = (slice(start[0] + low[0], start[0] + high[0]), slice(start[1] + low[1], start[1] + high[1]))
-        part = np.where(known[there], reduced.image[there], mean)
-        window[low[0] : high[0], low[1] : high[1]] = part
+        window[low[0] : high[0], low[1] : high[1]] = reduced.image[there]
     return window
 
 
