@@ -57,6 +57,8 @@ SCHEMAS: dict[str, pa.Schema] = {
         _field("techniques", _TEXT, "", "techniques fused, separated by '+'"),
         _field("features_used", pa.int64(), "count", "features that the most informative technique used"),
         _field("image_class", _TEXT, "", "normal, noisy or gradient; null where the image was refused"),
+        _field("rows", pa.int64(), _PIXEL, "rows of the array; null where nothing was known of the camera"),
+        _field("columns", pa.int64(), _PIXEL, "columns of the array; null where nothing was known of the camera"),
         _field("detail", _TEXT, "", "one line for a person"),
         _field("config_digest", _TEXT, "", "sha256 of the configuration"),
     ]),
@@ -201,6 +203,9 @@ def offset_row(document: Mapping[str, Json]) -> Row:
     row["features_used"] = max((_used(t) or 0 for t in fused), default=None)
     frame, provenance = document["frame"], document["provenance"]
     row["image_class"] = frame["image_class"] if isinstance(frame, dict) else None
+    geometry = document.get("geometry")
+    model = geometry["camera_model"] if isinstance(geometry, dict) else None
+    row["rows"], row["columns"] = _pair(model["shape_vu"]) if isinstance(model, dict) else (None, None)
     row["config_digest"] = provenance["config_digest"] if isinstance(provenance, dict) else None
     return row
 

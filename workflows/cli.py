@@ -13,13 +13,12 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from typer.exceptions import TyperException
 
-from catalogs.archive import open_archive
-from pipeline.curate import Json
 from pipeline.errors import ConfigurationError, PilotageError
 from workflows import (
     catalog_cli,
     config_cli,
     doctor_cli,
+    picture_cli,
     pose_cli,
     query_cli,
     report_cli,
@@ -42,7 +41,7 @@ from workflows.report import (
 )
 from workflows.run import EXIT_INTERRUPTED, EXIT_NOT_STARTED, RunListener, execute, exit_code
 from workflows.run_log import LogFormat, logged_to, terminal
-from workflows.store import RunFolder, read_json, refuse_foreign, write_atomically
+from workflows.store import RunFolder, document_of, refuse_foreign
 from workflows.task import Outcome
 
 app = typer.Typer(
@@ -58,6 +57,7 @@ app.command()(query_cli.query)
 app.command()(doctor_cli.doctor)
 app.command()(validate_cli.validate)
 app.command()(status_cli.status)
+app.command()(picture_cli.picture)
 
 _SILENT = RunListener(lambda workers: None, lambda outcome: None)
 _LOG_EVERY_S = 5.0
@@ -212,7 +212,7 @@ def show(
     """Show outcome counts, one image, or a run against planted truth."""
     folder, console = RunFolder(run_folder), _console()
     if image is not None:
-        print_image(console, _document(run_folder, image))
+        print_image(console, document_of(folder, image))
         return
     table = offsets(folder)
     print_counts(console, table)
@@ -224,39 +224,6 @@ def _console() -> Console:
     """The terminal's width where there is one; in a pipe or a log, wide enough for every table."""
     console = Console()
     return console if console.is_terminal else Console(width=_LOG_WIDTH)
-
-
-def _document(run_folder: Path, image: str) -> dict[str, Json]:
-    document = read_json(RunFolder(run_folder).document(image))
-    # The name of any other file beside the documents is no image either.
-    if document is None or document.get("image_id") != image:
-        raise ConfigurationError(f"{run_folder} has no image {image}")
-    return document
-
-
-@app.command()
-def picture(
-    run_folder: RunArg,
-    archive: ArchiveArg,
-    images: Annotated[list[str], typer.Argument(metavar="IMAGE...", help="Image ids.")],
-    output: Annotated[
-        Path | None, typer.Option("--output", "-o", help="PNG to write, for one image; RUN/pictures/IMAGE.png.")
-    ] = None,
-) -> None:
-    """Draw images with what was predicted, used and refused."""
-    # Drawing libraries take half a second to load, which no other command should pay.
-    from workflows.pictures import draw, draw_all
-
-    documents = [_document(run_folder, image) for image in images]
-    opened = open_archive(archive, {})
-    if output is None:
-        for path in draw_all(opened, RunFolder(run_folder), images):
-            typer.echo(f"{path}")
-        return
-    if len(images) > 1:
-        raise ConfigurationError("--output is for one image")
-    write_atomically(output, draw(opened, RunFolder(run_folder), documents[0]))
-    typer.echo(f"{output}")
 
 
 @app.command()

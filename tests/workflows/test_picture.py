@@ -1,3 +1,4 @@
+import shutil
 from io import BytesIO
 from pathlib import Path
 
@@ -10,6 +11,7 @@ from catalogs.images import read_image
 from pipeline.errors import ConfigurationError
 from tests.catalogs.planetary import pds3_label
 from tests.scenes.runs import run_archive
+from tests.support import pilotage
 from workflows.cli import app
 from workflows.picture import draw_image
 from workflows.pictures import chosen, draw_all
@@ -92,3 +94,17 @@ def test_a_label_finds_its_pixels(tmp_path: Path) -> None:
     run_archive(archive, tmp_path / "run")
     drawn = draw_all(open_archive(str(archive), {}), RunFolder(tmp_path / "run"), ["pixels"])
     assert [path.name for path in drawn if path.exists()] == ["pixels.png"]
+
+
+def test_the_run_remembers_its_archive(run: Path, tmp_path: Path) -> None:
+    folder = RunFolder(run / "run")
+    first, second, *_ = sorted(path.stem for path in folder.images.glob("[!.]*.json"))
+    shutil.rmtree(folder.root / "pictures", ignore_errors=True)
+    for words in ([first, second], [run / "archive", first, second], ["--archive", run / "archive", first, second]):
+        ended = pilotage("picture", folder.root, *words)
+        assert ended.code == 0, ended.err
+        assert len(ended.out.splitlines()) == 2
+    assert "has no image nothing" in pilotage("picture", folder.root, "nothing").refusal()
+    shutil.copytree(folder.root, tmp_path / "unfinished")
+    (tmp_path / "unfinished" / "run.json").unlink()
+    assert "--archive" in pilotage("picture", tmp_path / "unfinished", first).refusal()
