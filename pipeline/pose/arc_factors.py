@@ -34,6 +34,41 @@ class AttitudeFix(Record):
 
 
 @dataclass(frozen=True, eq=False)
+class DirectionFix(Record):
+    """Where a limb, a disc or rings were seen: the direction to the body's centre, whatever the attitude.
+
+    An attitude that is made from it is wrong by as much as the position is.
+
+    Attributes
+    ----------
+    direction
+        (3,) unit vector in the camera frame.
+    covariance_rad2
+        (3, 3) of its error, camera axes; what it says along the direction plays no part.
+    """
+
+    direction: FloatArray
+    covariance_rad2: FloatArray
+
+    def __post_init__(self) -> None:
+        self._freeze(direction=(3,), covariance_rad2=(3, 3))
+        if not abs(float(np.linalg.norm(self.direction)) - 1.0) < 1e-6:
+            raise MatchError("a direction that is no unit vector")
+        check_covariances("direction covariance", self.tangent_covariance[None])
+
+    @property
+    def tangent(self) -> FloatArray:
+        """(2, 3) unit vectors across the direction."""
+        return np.asarray(np.linalg.svd(self.direction[None])[2][1:])
+
+    @property
+    def tangent_covariance(self) -> FloatArray:
+        """(2, 2) along :attr:`tangent`."""
+        across = self.tangent
+        return np.asarray(across @ self.covariance_rad2 @ across.T)
+
+
+@dataclass(frozen=True, eq=False)
 class ArcImage(Record):
     """One image of an arc.
 
@@ -47,15 +82,15 @@ class ArcImage(Record):
         Trajectory's position and the attitude that was believed.
     fix
         Pose from landmarks, if any, with its covariance.
-    attitude_fix
-        Attitude from an offset, if any.
+    offset
+        What an offset measured, if any: stars an attitude, a body a direction.
     """
 
     image_id: str
     et: float
     prior: Pose
     fix: PosePrior | None = None
-    attitude_fix: AttitudeFix | None = None
+    offset: AttitudeFix | DirectionFix | None = None
 
     def __post_init__(self) -> None:
         if not np.isfinite(self.et):
@@ -224,8 +259,80 @@ def image_factors(
     if image.fix is not None:
         measured = SE3Utils.to_gtsam(image.fix.pose)
         graph.add(gtsam.PriorFactorPose3(key, measured, weighted(fix_noise(image.fix))))
-    if image.attitude_fix is not None:
-        turn = image.attitude_fix.camera_from_body
-        model = gtsam.noiseModel.Gaussian.Covariance(turn @ image.attitude_fix.covariance_rad2 @ turn.T)
-        graph.add(gtsam.PoseRotationPrior3D(key, gtsam.Rot3(turn.T), weighted(model)))
+    if image.offset is not None:
+        model = weighted(gtsam.noiseModel.Gaussian.Covariance(offset_covariance(image.offset)))
+        if isinstance(image.offset, AttitudeFix):
+            graph.add(gtsam.PoseRotationPrior3D(key, gtsam.Rot3(image.offset.camera_from_body.T), model))
+        else:
+            graph.add(direction_factor(key, image.offset, model))
     return graph
+
+
+def direction_factor(key: int, fix: DirectionFix, model: gtsam.noiseModel.Base) -> gtsam.CustomFactor:
+    """Direction of the body's centre, in the camera frame.
+
+    Parameters
+    ----------
+    key
+        Of the pose.
+    fix
+        What was measured.
+    model
+        Noise of two rows.
+
+    Returns
+    -------
+    gtsam.CustomFactor
+        Two rows across the measured direction.
+    """
+
+    def error(this: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[FloatArray] | None) -> FloatArray:
+        residual, slope = offset_residual(fix, SE3Utils.from_gtsam(values.atPose3(this.keys()[0])))
+        if jacobians is not None:
+            jacobians[0] = np.asfortranarray(slope)
+        return residual
+
+    return gtsam.CustomFactor(model, [key], error)
+
+
+def offset_covariance(offset: AttitudeFix | DirectionFix) -> FloatArray:
+    """Covariance of an offset's rows in the graph.
+
+    Parameters
+    ----------
+    offset
+        What was measured.
+
+    Returns
+    -------
+    numpy.ndarray
+        (3, 3) of a rotation in camera axes, or (2, 2) across a direction.
+    """
+    if isinstance(offset, DirectionFix):
+        return offset.tangent_covariance
+    turn = offset.camera_from_body
+    return np.asarray(turn @ offset.covariance_rad2 @ turn.T)
+
+
+def offset_residual(offset: AttitudeFix | DirectionFix, pose: Pose) -> tuple[FloatArray, FloatArray]:
+    """How far a pose is from what an offset measured.
+
+    Parameters
+    ----------
+    offset
+        What was measured.
+    pose
+        The pose.
+
+    Returns
+    -------
+    tuple
+        (k,) rows, as in the graph; (k, 6) their derivative along GTSAM's tangent (rotation, translation).
+    """
+    if isinstance(offset, AttitudeFix):
+        return SE3Utils.log(offset.camera_from_body @ pose.camera_from_body.T), np.eye(3, 6)
+    centre = -pose.camera_from_body @ pose.position_km
+    distance = float(np.linalg.norm(centre))
+    unit = centre / distance
+    slope = offset.tangent @ (np.eye(3) - np.outer(unit, unit)) / distance
+    return offset.tangent @ unit, slope @ np.hstack([SE3Utils.skew(centre), -np.eye(3)])

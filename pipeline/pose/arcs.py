@@ -16,13 +16,24 @@ from pydantic import Field
 from scipy.stats import chi2
 
 from pipeline.options import Options
-from pipeline.pose.arc_factors import BIAS_KEY, ArcImage, ArcNoise, first_factors, image_factors, step_factor
+from pipeline.pose.arc_factors import (
+    BIAS_KEY,
+    ArcImage,
+    ArcNoise,
+    first_factors,
+    image_factors,
+    offset_covariance,
+    offset_residual,
+    step_factor,
+)
 from pipeline.pose.graph import pose_key
-from pipeline.pose.records import MatchError, Pose, SourceLabel
+from pipeline.pose.records import MatchError, Pose, PosePrior, SourceLabel
 from pipeline.pose.se3 import SE3Utils
 from pipeline.records import BoolArray, FloatArray, Record
 
 _FIX_ROWS = 6
+# Columns of what holds an image: its landmark fix, its offset.
+_FIX, _OFFSET = 0, 1
 # Fixes taken back settle at once or in two or three rounds.
 _MOST_ROUNDS = 5
 # Kilometres and radians: a stale linearisation by an angle a misplaces a range by half its square.
@@ -64,6 +75,8 @@ class ArcResult(Record):
         (n, 6, 6) of errors (x, y, z, rx, ry, rz), km and rad, body-fixed.
     used
         (n,) True where the image's own landmark fix holds it.
+    offset_used
+        (n,) True where the image's own offset does.
     label
         What holds each pose.
     anchor_age_ms
@@ -79,6 +92,7 @@ class ArcResult(Record):
     position_km: FloatArray
     covariance: FloatArray
     used: BoolArray
+    offset_used: BoolArray
     label: tuple[SourceLabel, ...]
     anchor_age_ms: tuple[int | None, ...]
     bias_rad: FloatArray
@@ -87,8 +101,8 @@ class ArcResult(Record):
     def __post_init__(self) -> None:
         n = len(self.image_id)
         self._freeze(
-            camera_from_body=(n, 3, 3), position_km=(n, 3), covariance=(n, 6, 6), used=(n,), bias_rad=(3,),
-            bias_covariance_rad2=(3, 3),
+            camera_from_body=(n, 3, 3), position_km=(n, 3), covariance=(n, 6, 6), used=(n,), offset_used=(n,),
+            bias_rad=(3,), bias_covariance_rad2=(3, 3),
         )  # fmt: skip
 
     def pose(self, index: int) -> Pose:
@@ -143,7 +157,7 @@ def smooth_arc(images: Sequence[ArcImage], options: ArcOptions | None = None) ->
     starts = list(range(0, len(images), o.segment))
     segments = [_Segment(k, min(k + o.segment, len(images)), images, o) for k in starts]
     # Forward: which fixes hold, and what each segment hands on to its right.
-    used = np.zeros(len(images), dtype=bool)
+    used = np.zeros((len(images), 2), dtype=bool)
     lefts = [_Handed(first_factors(images[0], o.noise()), gtsam.Values())]
     points: list[gtsam.Values] = []
     for segment in segments:
@@ -194,15 +208,17 @@ class _Segment:
         noise, graph = self.options.noise(), gtsam.NonlinearFactorGraph()
         for k in range(self.start, self.stop):
             image = self.images[k]
-            if robust is None and not used[k]:
-                image = replace(image, fix=None)
+            if robust is None:
+                image = replace(
+                    image, fix=image.fix if used[k, _FIX] else None, offset=image.offset if used[k, _OFFSET] else None
+                )
             graph.push_back(image_factors(k, image, noise, robust))
             if k:
                 graph.add(step_factor(k - 1, self.images[k - 1], self.images[k], noise))
         return graph
 
     def settle(self, left: _Handed, used: BoolArray) -> gtsam.Values:
-        """Solve with what lies to the left, robustly; sets ``used`` for the segment's images."""
+        """Solve with what lies to the left, robustly; sets ``used`` (fix, offset) for the segment's images."""
         values = gtsam.Values()
         values.insert(BIAS_KEY, np.zeros(3))
         for k in range(max(self.start - 1, 0), self.stop):
@@ -216,28 +232,44 @@ class _Segment:
             graph.push_back(left.graph)
             values = _optimize(graph, values)
         for k in range(self.start, self.stop):
-            used[k] = _distance(self.images[k], values.atPose3(pose_key(k))) <= gate
-        return self._call_back(left, values, used, gate)
+            for kind in (_FIX, _OFFSET):
+                used[k, kind] = self._within(k, kind, values.atPose3(pose_key(k)))
+        return self._call_back(left, values, used)
 
-    def _call_back(self, left: _Handed, values: gtsam.Values, used: BoolArray, gate: float) -> gtsam.Values:
+    def _within(self, k: int, kind: int, pose: gtsam.Pose3, covariance: FloatArray | None = None) -> bool:
+        """Whether an image's fix or offset is within the gate of a pose, with the errors of one that is free of it."""
+        image, chance = self.images[k], self.options.outlier_chance
+        if kind == _FIX:
+            return image.fix is not None and _fix_distance2(image.fix, pose, covariance) <= chi2.isf(chance, _FIX_ROWS)
+        if image.offset is None:
+            return False
+        residual, slope = offset_residual(image.offset, SE3Utils.from_gtsam(pose))
+        total = offset_covariance(image.offset)
+        if covariance is not None:
+            total = total + slope @ covariance @ slope.T
+        return bool(residual @ np.linalg.solve(total, residual) <= chi2.isf(chance, len(residual)))
+
+    def _call_back(self, left: _Handed, values: gtsam.Values, used: BoolArray) -> gtsam.Values:
         """Solve with the fixes that are used, and take back those that neighbours of a wrong one were left out with."""
         for _ in range(_MOST_ROUNDS):
             graph = self.graph(used, None)
             graph.push_back(left.graph)
             values = _optimize(graph, values)
-            out = [k for k in range(self.start, self.stop) if self.images[k].fix is not None and not used[k]]
+            out = [
+                (k, kind) for k in range(self.start, self.stop) for kind in (_FIX, _OFFSET)
+                if (self.images[k].fix, self.images[k].offset)[kind] is not None and not used[k, kind]
+            ]  # fmt: skip
             if not out:
                 break
             marginals = gtsam.Marginals(graph, values)
             # A pose that a fix does not hold has an error of its own.
-            away = [
-                _distance(self.images[k], values.atPose3(pose_key(k)), marginals.marginalCovariance(pose_key(k)))
-                for k in out
-            ]
-            back = [k for k, distance in zip(out, away, strict=True) if distance <= gate]
+            back = [
+                (k, kind) for k, kind in out
+                if self._within(k, kind, values.atPose3(pose_key(k)), marginals.marginalCovariance(pose_key(k)))
+            ]  # fmt: skip
             if not back:
                 break
-            used[back] = True
+            used[tuple(np.transpose(back))] = True
         return values
 
     def hand_on(
@@ -286,23 +318,21 @@ def _optimize(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.
     return gtsam.LevenbergMarquardtOptimizer(graph, values, params).optimize()
 
 
-def _distance(image: ArcImage, pose: gtsam.Pose3, covariance: FloatArray | None = None) -> float:
-    """Sigmas between an image's fix and its pose, with those of a pose that is free of it; infinite without one."""
-    if image.fix is None:
-        return float(np.inf)
-    away = SE3Utils.to_gtsam(image.fix.pose).localCoordinates(pose)
-    total = SE3Utils.gtsam_from_error(image.fix.covariance, image.fix.pose.camera_from_body)
+def _fix_distance2(fix: PosePrior, pose: gtsam.Pose3, covariance: FloatArray | None = None) -> float:
+    """Squared sigmas between a fix and a pose, with those of a pose that is free of it."""
+    away = SE3Utils.to_gtsam(fix.pose).localCoordinates(pose)
+    total = SE3Utils.gtsam_from_error(fix.covariance, fix.pose.camera_from_body)
     if covariance is not None:
         total = total + covariance
-    return float(np.sqrt(away @ np.linalg.solve(total, away)))
+    return float(away @ np.linalg.solve(total, away))
 
 
 def _result(images: Sequence[ArcImage], parts: list[_Part], used: BoolArray) -> ArcResult:
-    label, age = labels_of([image.et for image in images], used)
+    label, age = labels_of([image.et for image in images], used[:, _FIX])
     return ArcResult(
         tuple(image.image_id for image in images), np.array([t for p in parts for t in p.turns]),
-        np.array([x for p in parts for x in p.places]), np.array([c for p in parts for c in p.covariances]), used,
-        label, age, parts[0].bias, parts[0].bias_covariance,
+        np.array([x for p in parts for x in p.places]), np.array([c for p in parts for c in p.covariances]),
+        used[:, _FIX], used[:, _OFFSET], label, age, parts[0].bias, parts[0].bias_covariance,
     )  # fmt: skip
 
 

@@ -8,7 +8,15 @@ import pytest
 from numpy.testing import assert_allclose
 
 from pipeline.camera import project
-from pipeline.pose.arc_factors import BIAS_KEY, ArcImage, AttitudeFix, attitude_factor, step_factor
+from pipeline.pose.arc_factors import (
+    BIAS_KEY,
+    ArcImage,
+    AttitudeFix,
+    DirectionFix,
+    attitude_factor,
+    direction_factor,
+    step_factor,
+)
 from pipeline.pose.arcs import ArcOptions, ArcResult, GrowingArc, labels_of, smooth_arc
 from pipeline.pose.estimator import OpenCVGtsamPoseEstimator
 from pipeline.pose.graph import pose_key, resection_factor
@@ -153,11 +161,52 @@ def test_attitude_fixes_show_the_bias_without_a_position() -> None:
     for image, pose in zip(images, poses, strict=True):
         r = rng.normal(size=3) * 2e-5
         turn = pose.camera_from_body @ SE3Utils.exp(r)
-        measured.append(replace(image, attitude_fix=AttitudeFix(turn, np.eye(3) * 4e-10)))
+        measured.append(replace(image, offset=AttitudeFix(turn, np.eye(3) * 4e-10)))
     result = smooth_arc(measured, OPTIONS)
     away = result.bias_rad - bias
     assert np.sqrt(away @ np.linalg.solve(result.bias_covariance_rad2, away)) < 4.5
     assert np.linalg.norm(away) < 0.1 * np.linalg.norm(bias)
+
+
+def _with_directions(images: list[ArcImage], poses: list[Pose], seed: int) -> tuple[list[ArcImage], np.ndarray]:
+    """Offsets from the body's place in every image, a twentieth of them wrong."""
+    rng, seen = np.random.default_rng(seed), []
+    wild = rng.random(len(images)) < 0.05
+    for k, (image, pose) in enumerate(zip(images, poses, strict=True)):
+        turn = SE3Utils.exp(rng.normal(size=3) * 2e-5 * (300.0 if wild[k] else 1.0))
+        centre = turn @ pose.camera_from_body @ -pose.position_km
+        fix = DirectionFix(centre / np.linalg.norm(centre), np.eye(3) * 4e-10)
+        seen.append(replace(image, offset=fix))
+    return seen, wild
+
+
+def test_directions_of_the_body_hold_an_arc_and_their_covariances_too() -> None:
+    nees, sizes = [], []
+    for seed in range(4):
+        images, poses, _ = plant_arc(60, 30 + seed, OPTIONS, gap=0.8, outliers=0.0)
+        seen, wild = _with_directions(images, poses, seed)
+        with_them, without = smooth_arc(seen, OPTIONS), smooth_arc(images, OPTIONS)
+        assert not (with_them.offset_used & wild).any()
+        assert with_them.offset_used.sum() > 0.95 * (~wild).sum()
+        assert not without.offset_used.any()
+        nees.append(_nees(with_them, poses).mean())
+        sizes.append(np.linalg.det(with_them.covariance) / np.linalg.det(without.covariance))
+    assert 5.2 < np.mean(nees) < 6.8
+    assert np.mean(np.array(sizes) < 0.5) > 0.9
+
+
+def test_a_direction_leaves_position_and_attitude_along_it_open() -> None:
+    images, poses, _ = plant_arc(3, 41, OPTIONS, gap=1.0)
+    seen, _ = _with_directions(images, poses, 1)
+    values = gtsam.Values()
+    values.insert(pose_key(1), SE3Utils.to_gtsam(poses[1]).retract(np.full(6, 1e-3)))
+    offset = seen[1].offset
+    assert isinstance(offset, DirectionFix)
+    factor = direction_factor(pose_key(1), offset, gtsam.noiseModel.Unit.Create(2))
+    _numerical(factor, values)
+    for wrong, message in (([0, 0, 2.0], "unit vector"), ([0, 0, 1.0], "zero or negative")):
+        with pytest.raises(MatchError, match=message):
+            DirectionFix(np.array(wrong), np.diag([0.0, 1.0, 1.0]))
 
 
 def test_labels_and_ages() -> None:
