@@ -25,6 +25,8 @@ _WIDE_SEARCH_PX = 40.0
 # Residuals within a block of cells may be alike: at least so many cells, and so many pixels, along a side.
 _BLOCK_CELLS = 6
 _BLOCK_PX = 3.0
+# Peak and regression farther apart than this are not averaged: the regression is linear in the shift.
+_MOST_APART_CELLS = 1.0
 
 
 class PeakStatus(StrEnum):
@@ -46,8 +48,8 @@ class CorrelationOptions(Options):
     subpixel: Literal["quadratic", "taylor"] = Field("quadratic", description="fit of the peak, over 3 x 3 or per axis")
     least_correlation: float = Field(0.35, ge=-1, le=1, description="correlation below which nothing was found")
     least_cells: int = Field(100, ge=9, description="cells valid in both images that a correlation needs")
-    passes: int = Field(3, ge=1, le=10, description="correlations at bin 1 at most, each on images extracted anew")
-    tolerance_cells: float = Field(0.25, gt=0, description="shift below which no further pass is needed, cells")
+    passes: int = Field(4, ge=1, le=10, description="correlations at bin 1 at most, each on images extracted anew")
+    tolerance_cells: float = Field(0.1, gt=0, description="shift below which no further pass is needed, cells")
 
 
 @dataclass(frozen=True, eq=False)
@@ -288,11 +290,12 @@ def correlate(
     if not with_covariance:
         return Peak(PeakStatus.FOUND, (whole + step) * size, np.full((2, 2), np.nan), height, 0)
     block = max(_BLOCK_CELLS, round(_BLOCK_PX / pixels_per_cell / size))
-    covariance, cells = _covariance(predicted, extracted, whole + widening // size, block)
-    both = quadratic_peak(surface, (i, j))
-    if both is not None:
-        # The series per axis leaves out how the axes are tied together: what that moves the peak by is its error.
-        covariance = covariance + np.diag((both - step) ** 2)
+    regressed, covariance, cells = _regression(predicted, extracted, whole + widening // size, block)
+    apart = np.nan_to_num(regressed - step)
+    if np.abs(apart).max() <= _MOST_APART_CELLS:
+        step = step + apart / 2.0
+    # Peak and regression weigh the same cells differently: what parts them is an error that the residuals do not show.
+    covariance = covariance + np.eye(2) * (apart @ apart) / 2.0
     return Peak(PeakStatus.FOUND, (whole + step) * size, covariance * size**2, height, cells)
 
 
@@ -300,13 +303,13 @@ def _nothing(status: PeakStatus, height: float) -> Peak:
     return Peak(status, np.full(2, np.nan), np.full((2, 2), np.nan), height, 0)
 
 
-def _covariance(
+def _regression(
     predicted: tuple[FloatArray, BoolArray], extracted: tuple[FloatArray, BoolArray], start: np.ndarray, block: int
-) -> tuple[FloatArray, int]:
-    """Covariance of the shift in binned cells, and how many cells it rests on.
+) -> tuple[FloatArray, FloatArray, int]:
+    """Shift beyond a whole one in binned cells, its covariance, and how many cells they rest on.
 
-    The extracted image is regressed on light, level and both derivatives of the predicted one, so that a fraction of a
-    cell between the images is not taken for noise; scores are summed over blocks of cells before they are squared.
+    The extracted image is regressed on light, level and both derivatives of the predicted one: predicted(x - s) has
+    -s times the derivatives. Scores are summed over blocks of cells before they are squared.
     """
     (p, mp), (e, me) = predicted, extracted
     n, m = len(p), len(e)
@@ -320,7 +323,7 @@ def _covariance(
     valid[[0, -1]] = valid[:, [0, -1]] = False
     i, j = np.nonzero(valid)
     if len(i) < 20:
-        return np.full((2, 2), np.nan), len(i)
+        return np.full(2, np.nan), np.full((2, 2), np.nan), len(i)
     dx, dy = 0.5 * (p[i + 1, j] - p[i - 1, j]), 0.5 * (p[i, j + 1] - p[i, j - 1])
     columns = np.stack([p[i, j] - p[i, j].mean(), np.ones(len(i)), dx, dy], axis=1)
     normal = columns.T @ columns
@@ -334,7 +337,7 @@ def _covariance(
     plain = bread * float(residual @ residual) / max(len(i) - 4, 1)
     scale = max(abs(float(answer[0])), 1e-30)
     # Blocks are few: a direction in which their scores happen to cancel keeps what independent cells would give.
-    return _larger(sandwich[2:, 2:], plain[2:, 2:]) / scale**2, len(i)
+    return -answer[2:] / float(answer[0] or 1e-30), _larger(sandwich[2:, 2:], plain[2:, 2:]) / scale**2, len(i)
 
 
 def _larger(first: FloatArray, second: FloatArray) -> FloatArray:
