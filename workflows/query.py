@@ -3,7 +3,7 @@
 import csv
 import io
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 
 import duckdb
@@ -57,6 +57,34 @@ def ask(folder: RunFolder, question: str) -> pa.Table:
             return database.sql(question).to_arrow_table()
         except duckdb.Error as error:
             raise ConfigurationError(f"query: {_reason(str(error), question, columns)}") from error
+
+
+def ask_many(folder: RunFolder, steps: Mapping[str, str], questions: Mapping[str, str]) -> dict[str, pa.Table]:
+    """Answers of several SELECTs of our own that share intermediate tables.
+
+    Parameters
+    ----------
+    folder
+        The run.
+    steps
+        SELECT by name of an intermediate table, which later ones and the questions may use.
+    questions
+        SELECT by name of an answer.
+
+    Returns
+    -------
+    dict
+        Rows by name of the question.
+
+    Raises
+    ------
+    ConfigurationError
+        If the run has no tables.
+    """
+    with _database(folder) as (database, _):
+        for name, step in steps.items():
+            database.execute(f"CREATE TEMP TABLE {name} AS {step}")
+        return {name: database.sql(question).to_arrow_table() for name, question in questions.items()}
 
 
 def _reason(text: str, question: str, columns: dict[str, list[str]]) -> str:

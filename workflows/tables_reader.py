@@ -14,7 +14,7 @@ _PARTITION = ("mission", "camera")
 
 
 def open_tables(folder: RunFolder) -> dict[str, ds.Dataset]:
-    """All tables that a run has, in today's columns.
+    """All tables, in today's columns; those that a run has no rows of are empty.
 
     Parameters
     ----------
@@ -34,7 +34,8 @@ def open_tables(folder: RunFolder) -> dict[str, ds.Dataset]:
     tables = {name: table for name in SCHEMAS if (table := _open_table(folder.root / name, name)) is not None}
     if not tables:
         raise ConfigurationError(f"{folder.root} holds no finished run: it has no tables")
-    return tables
+    # An older version knew fewer of them, and questions are asked by name.
+    return {name: tables.get(name) or ds.dataset(schema.empty_table()) for name, schema in SCHEMAS.items()}
 
 
 def _open_table(root: Path, name: str) -> ds.Dataset | None:

@@ -7,11 +7,14 @@ import pandas as pd
 import plotly.graph_objects as go
 
 # Okabe and Ito 2008: told apart by colour-blind eyes; each camera has a shape of its own beside.
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#4D4D4D")
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#808080")
 SYMBOLS = ("circle", "square", "diamond", "cross", "triangle-up", "x", "star")
 MOST_POINTS = 1000
 """Points of one figure: a page of a hundred thousand images stays light."""
 _HEIGHT, _BAR_HEIGHT = 340, 30
+# The page shows through, in its light and in its dark colours.
+_CLEAR = "rgba(0,0,0,0)"
+RANKS = ("high", "medium", "low", "conflicted", "failed")
 
 
 def sample(rows: pd.DataFrame, most: int = MOST_POINTS) -> pd.DataFrame:
@@ -37,7 +40,7 @@ def sample(rows: pd.DataFrame, most: int = MOST_POINTS) -> pd.DataFrame:
 def _layout(figure: go.Figure, x: str, y: str) -> go.Figure:
     figure.update_layout(
         height=_HEIGHT, margin={"l": 62, "r": 12, "t": 12, "b": 52}, xaxis_title=x, yaxis_title=y, hovermode="closest",
-        showlegend=True, paper_bgcolor="#ffffff", plot_bgcolor="#ffffff",
+        showlegend=True, paper_bgcolor=_CLEAR, plot_bgcolor=_CLEAR,
         font={"family": "system-ui, sans-serif", "color": "#1c2127"},
         legend={"orientation": "h", "y": 1.02, "yanchor": "bottom", "x": 0},
     )  # fmt: skip
@@ -70,6 +73,8 @@ def scatter(
         Sampled.
     """
     figure = go.Figure()
+    if x == "rank":
+        figure.update_xaxes(categoryorder="array", categoryarray=RANKS)
     shown = sample(rows.dropna(subset=[x, y]).sort_values("image_id"))
     hover = f"<b>%{{customdata}}</b><br>%{{fullData.name}}<br>{titles[1]} %{{y}}<br>{titles[0]} %{{x}}<extra></extra>"
     for k, (name, group) in enumerate(shown.groupby(by, observed=True)):
@@ -104,7 +109,8 @@ def bars(names: Sequence[str], values: Sequence[float], titles: tuple[str, str])
     figure = go.Figure()
     figure.add_bar(
         x=list(values), y=list(names), orientation="h", marker_color=COLOURS[0],
-        text=[f"{value:.4g}" for value in values], hovertemplate="%{y}: %{x}<extra></extra>",
+        text=[f"{value:.4g}" for value in values], textposition="outside", cliponaxis=False,
+        hovertemplate="%{y}: %{x}<extra></extra>",
     )  # fmt: skip
     _layout(figure, *titles)
     figure.update_yaxes(autorange="reversed", automargin=True)
@@ -139,3 +145,83 @@ def histogram(groups: dict[str, np.ndarray], titles: tuple[str, str]) -> go.Figu
     _layout(figure, *titles)
     figure.update_xaxes(type="log")
     return figure
+
+
+def trend(bins: pd.DataFrame, y: str, titles: tuple[str, str], log_y: bool = False) -> go.Figure:
+    """One line per camera over its spells of time.
+
+    Parameters
+    ----------
+    bins
+        Of :func:`workflows.html_report.trend.spells`.
+    y
+        Column.
+    titles
+        Of the axes.
+    log_y
+        Logarithmic ordinate.
+
+    Returns
+    -------
+    plotly.graph_objects.Figure
+        A point stands at the middle image of its spell.
+    """
+    figure = go.Figure()
+    for k, (camera, group) in enumerate(bins.groupby("camera", observed=True)):
+        figure.add_scatter(
+            x=group["middle"].to_list(), y=group[y].to_list(), mode="lines+markers", name=str(camera),
+            customdata=group[["images", "start", "stop"]].to_numpy().tolist(),
+            hovertemplate="%{fullData.name}<br>%{y:.4g}<br>%{customdata[0]} images from %{customdata[1]} to "
+            "%{customdata[2]}<extra></extra>",
+            line={"color": COLOURS[k % len(COLOURS)], "dash": ("solid", "dash", "dot")[k % 3]},
+            marker={"symbol": SYMBOLS[k % len(SYMBOLS)], "size": 7},
+        )  # fmt: skip
+    if log_y:
+        figure.update_yaxes(type="log")
+    return _layout(figure, *titles)
+
+
+def arrows(field: pd.DataFrame, cells: int, titles: tuple[str, str]) -> tuple[go.Figure, float]:
+    """Mean residuals as arrows over the array, rows downward.
+
+    Parameters
+    ----------
+    field
+        ``camera, row_cell, column_cell, dv_px, du_px, sigma_px, features`` per cell.
+    cells
+        Along each side.
+    titles
+        Of the axes.
+
+    Returns
+    -------
+    tuple
+        The figure; the length in pixels of an arrow that is one cell long.
+    """
+    figure = go.Figure()
+    lengths = np.hypot(field["dv_px"], field["du_px"])
+    # Most arrows stay inside their cell; a few cells of one feature may be far longer than all others.
+    unit = float(max(np.quantile(lengths, 0.9), 1e-6)) if len(field) else 1.0
+    for k, (camera, group) in enumerate(field.groupby("camera", observed=True)):
+        v, u = (group["row_cell"] + 0.5) / cells, (group["column_cell"] + 0.5) / cells
+        tip_v, tip_u = v + group["dv_px"] / unit / cells, u + group["du_px"] / unit / cells
+        nothing = [None] * len(group)
+        colour = COLOURS[k % len(COLOURS)]
+        figure.add_scatter(
+            x=[x for point in zip(u, tip_u, nothing, strict=True) for x in point],
+            y=[x for point in zip(v, tip_v, nothing, strict=True) for x in point], mode="lines", hoverinfo="skip",
+            legendgroup=str(camera), showlegend=False, line={"color": colour, "width": 1.5},
+        )  # fmt: skip
+        figure.add_scatter(
+            x=tip_u.to_list(), y=tip_v.to_list(), mode="markers", name=str(camera), legendgroup=str(camera),
+            text=[
+                f"dv {row.dv_px:+.4f}, du {row.du_px:+.4f} px ± {row.sigma_px:.4f}, {row.features} features"
+                for row in group.itertuples()
+            ],
+            hovertemplate="%{fullData.name}<br>%{text}<extra></extra>",
+            marker={"color": colour, "symbol": SYMBOLS[k % len(SYMBOLS)], "size": 5},
+        )  # fmt: skip
+    _layout(figure, *titles)
+    figure.update_xaxes(range=[0, 1])
+    figure.update_yaxes(range=[1, 0])
+    return figure, unit

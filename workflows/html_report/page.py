@@ -11,18 +11,18 @@ import cv2
 import numpy as np
 import pandas as pd
 import plotly.graph_objects as go
-import plotly.io as pio
 from plotly.offline import get_plotlyjs
 
 from pipeline.curate import Json
-from workflows.html_report.figures import bars, histogram, scatter
-from workflows.html_report.rows import Change, RunRows, strangest
+from workflows.html_report.figures import arrows, bars, histogram, scatter, trend
+from workflows.html_report.rows import FIELD_CELLS, MOST_PULL, Change, RunRows, strangest
 from workflows.html_report.style import SCRIPT, STYLE
+from workflows.html_report.trend import spells, worse_than_usual
 
 _THUMBNAIL_PX = 720
 _MOST_LISTED, _MOST_EMBEDDED = 40, 36
-MOST_PULL, MOST_STRANGENESS = 4.0, 10.0
-"""Sigmas from which two techniques are said to disagree, and an answer to be unlike its camera's others."""
+MOST_STRANGENESS = 10.0
+"""Sigmas from which an answer is said to be unlike its camera's others."""
 
 
 @dataclass(frozen=True)
@@ -33,9 +33,12 @@ class Pictures:
     ----------
     folder
         PNG files named by image id; need not exist.
+    address
+        The same, as the page's links reach it.
     """
 
     folder: Path
+    address: str = "pictures"
 
     def embedded(self, image_ids: Sequence[str]) -> dict[str, str]:
         """Data URIs of those that exist, shrunk."""
@@ -76,15 +79,17 @@ def render(
         HTML; the same tables give the same text.
     """
     strange = strangest(rows.answers)
-    parts = [_headline(title, rows, strange)]
+    lately = spells(rows.answers)
+    worse = [*([] if change is None else _against(change)), *worse_than_usual(lately)]
+    parts = [_headline(title, rows, strange, worse)]
     if change is not None:
         parts.append(_changes(change))
-    parts += [_outcomes(rows), _offsets(rows), _agreement(rows), _speed(rows), _strange(strange), _failures(rows)]
-    parts.append(_provenance(provenance))
+    parts += [_outcomes(rows), _trend(lately), _offsets(rows), _field(rows), _agreement(rows), _speed(rows)]
+    parts += [_strange(strange, rows), _failures(rows), _provenance(provenance)]
     first_failures = [image_id for ids in rows.failed["first_ids"] for image_id in ids[:3]]
-    worst = _worst_pairs(rows)["image_id"]
+    worst = [*rows.conflicts["image_id"], *rows.worst_pairs["image_id"]]
     wanted = [*strange["image_id"], *first_failures, *worst, *rows.slowest["image_id"]]
-    shown = {"pictures": pictures.embedded(wanted[:_MOST_EMBEDDED])}
+    shown = {"pictures": pictures.embedded(wanted[:_MOST_EMBEDDED]), "address": pictures.address}
     # A closing tag inside a script would end it.
     data = json.dumps(shown, sort_keys=True).replace("</", "<\\/")
     body = "\n".join(parts)
@@ -107,12 +112,11 @@ def _section(name: str, *content: str) -> str:
 
 def _figure(figure: go.Figure, name: str, said: str) -> str:
     """One figure with its caption, which is its text alternative too."""
-    drawn = pio.to_html(
-        figure, full_html=False, include_plotlyjs=False, div_id=f"plot-{name}",
-        config={"displaylogo": False, "responsive": True},
-    )  # fmt: skip
+    # A closing tag inside a script would end it.
+    content = (figure.to_json() or "").replace("</", "<\\/")
     return (
-        f'<figure role="group" aria-label="{html.escape(said, quote=True)}">{drawn}'
+        f'<figure role="group" aria-label="{html.escape(said, quote=True)}"><div class="plot" id="plot-{name}"'
+        f' style="height:{figure.layout.height}px"></div><script type="application/json">{content}</script>'
         f"<figcaption>{html.escape(said)}</figcaption></figure>"
     )
 
@@ -146,7 +150,7 @@ def _cell(value: object) -> str:
     return f"{value:.4g}" if isinstance(value, float) else html.escape(str(value))
 
 
-def _headline(title: str, rows: RunRows, strange: pd.DataFrame) -> str:
+def _headline(title: str, rows: RunRows, strange: pd.DataFrame, worse: list[str]) -> str:
     answers = rows.answers
     count, solved = len(answers), int((answers["status"] == "success").sum())
     tiles = "".join(
@@ -154,13 +158,13 @@ def _headline(title: str, rows: RunRows, strange: pd.DataFrame) -> str:
         for status in ("success", "failed", "conflicted", "error")
         for number in [int((answers["status"] == status).sum())]
     )
-    look = [f"{n} ended as {reason.replace('_', ' ')}" for reason, n in
+    look = worse + [f"{n} ended as {reason.replace('_', ' ')}" for reason, n in
             zip(rows.failed["reason"], rows.failed["images"], strict=True)][:3]  # fmt: skip
     odd = int((strange["strangeness"] > MOST_STRANGENESS).sum())
     if odd:
         more = " or more" if odd == len(strange) else ""
         look.append(f"{odd}{more} lie more than {MOST_STRANGENESS:g} sigmas from their camera's others")
-    doubt = int((rows.pairs["pull"] > MOST_PULL).sum())
+    doubt = int(rows.by_pair["apart"].sum())
     if doubt:
         look.append(f"{doubt} pairs of techniques differ by more than {MOST_PULL:g} sigmas")
     share = 100.0 * solved / count if count else 0.0
@@ -203,26 +207,40 @@ def _offsets(rows: RunRows) -> str:
     return _section("Offsets", '<div class="grid">', *parts, "</div>")
 
 
-def _worst_pairs(rows: RunRows) -> pd.DataFrame:
-    worst: pd.DataFrame = rows.pairs.nlargest(10, "pull", keep="first")
-    return worst[["image_id", "pair", "pull"]]
+def _trend(lately: pd.DataFrame) -> str:
+    if not len(lately):
+        return _section("Trend", "<p>No image says when it was taken.</p>")
+    return _section(
+        "Trend", '<div class="grid">',
+        _figure(trend(lately, "solved_percent", ("time (UTC)", "navigated, %")), "solved-time",
+                "Share of images navigated, by camera, in spells of equal number."),
+        _figure(trend(lately, "sigma_px", ("time (UTC)", "median sigma, px"), log_y=True), "sigma-time",
+                "Median sigma of the answers of each spell."), "</div>",
+    )  # fmt: skip
+
+
+def _field(rows: RunRows) -> str:
+    if not len(rows.field):
+        return _section("Residuals over the array", "<p>No feature has a measured place.</p>")
+    figure, unit = arrows(rows.field, FIELD_CELLS, ("u, share of the columns", "v, share of the rows"))
+    said = (
+        f"Measured minus fitted places of used features, mean of {FIELD_CELLS} by {FIELD_CELLS} cells: an arrow "
+        f"from the cell's middle to its mark, a cell long for {unit:.3g} px. A pattern is what the camera model lacks."
+    )
+    return _section("Residuals over the array", _figure(figure, "residuals", said))
 
 
 def _agreement(rows: RunRows) -> str:
-    if not len(rows.pairs):
+    if not len(rows.by_pair):
         return _section("Agreement of techniques", "<p>No image has two techniques' answers that can be compared.</p>")
-    by_pair = rows.pairs.groupby("pair")["pull"]
-    summary = pd.DataFrame(
-        {"images": by_pair.size(), "median": by_pair.median(), "largest": by_pair.max()}
-    ).reset_index()  # fmt: skip
-    figure = scatter(rows.pairs.assign(order=np.arange(len(rows.pairs))), "order", "pull",
-                     ("pair of answers", "joint sigmas"), by="pair", log_y=True)  # fmt: skip
+    figure = scatter(rows.shown_pairs, "number", "pull", ("pair of answers", "joint sigmas"), by="pair", log_y=True)
     # Two dozen pairs would fill a narrow page with their key; hover names them.
     figure.update_layout(showlegend=False)
     return _section(
         "Agreement of techniques", _figure(figure, "pulls", "Distance of two techniques' answers over its sigma."),
-        _table(summary, "Joint sigmas between techniques, worse axis"),
-        _table(_worst_pairs(rows), "Largest disagreements"),
+        _table(rows.by_pair.rename(columns={"apart": f"beyond {MOST_PULL:g}"}),
+               "Joint sigmas between techniques, worse axis"),
+        _table(rows.worst_pairs, "Largest disagreements"),
     )  # fmt: skip
 
 
@@ -235,11 +253,15 @@ def _speed(rows: RunRows) -> str:
     )  # fmt: skip
 
 
-def _strange(strange: pd.DataFrame) -> str:
+def _strange(strange: pd.DataFrame, rows: RunRows) -> str:
     columns = ["image_id", "camera", "offset_dv_px", "offset_du_px", "sigma_px", "rank", "strangeness"]
-    return _section("Strangest answers", _table(
+    parts = [_table(
         strange[columns], "Farthest from the median of their camera, in sigmas of its scatter and their own"
-    ))  # fmt: skip
+    )]  # fmt: skip
+    if len(rows.conflicts):
+        said = "Conflicted: techniques contradict each other, by the largest distance in joint sigmas"
+        parts.append(_table(rows.conflicts, said))
+    return _section("Strangest answers", *parts)
 
 
 def _failures(rows: RunRows) -> str:
@@ -248,6 +270,15 @@ def _failures(rows: RunRows) -> str:
     question = "select image_id, detail from offsets where status_reason = '…'"
     ask = f'<p>All of one reason: <code>pilotage query RUN "{question}"</code></p>'
     return _section("Without an answer", _table(rows.failed, "By reason, with the first images of each"), ask)
+
+
+def _against(change: Change) -> list[str]:
+    """The other run in one line each way, where it differs."""
+    lost, solved, moved = len(change.failed), len(change.solved), len(change.moved)
+    if not lost + solved + moved:
+        return []
+    verdict = "worse than" if lost > solved else "better than" if solved > lost else "other than"
+    return [f"{verdict} the run compared with: {lost} newly without an answer, {solved} newly solved, {moved} moved"]
 
 
 def _changes(change: Change) -> str:

@@ -4,36 +4,94 @@ from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
+import pyarrow as pa
 
-from pipeline.geometry.pointing import move_pivot
-from workflows.query import ask
+from workflows.query import ask_many
 from workflows.store import RunFolder
 
 MOVED_SIGMAS = 3.0
 """Joint sigmas beyond which two runs' answers differ."""
-_ANSWERS = "select * exclude (detail, config_digest, techniques) from offsets order by image_id"
-_STAGES = """
-    select stage, median(seconds) as median_s, quantile_cont(seconds, 0.95) as p95_s, sum(seconds) as total_s
-    from timings group by stage order by total_s desc, stage
-"""
-_SLOWEST = """
-    select image_id, max(seconds) as seconds from timings where stage = 'total'
-    group by image_id order by seconds desc, image_id limit 12
-"""
-_FAILED = """
-    select status, status_reason as reason, count(*) as images, list(image_id order by image_id)[1:20] as first_ids
-    from offsets where status != 'success' group by all order by images desc, reason
+MOST_PULL = 4.0
+"""Joint sigmas beyond which two techniques are said to disagree."""
+FIELD_CELLS = 12
+"""Cells of the residual map along each side of the array."""
+_SHOWN_PAIRS = 1000
+
+# Two techniques on one image: the second one's offset d about its pivot p, moved to the first one's pivot c, is
+# d + (I - R)(p - c). Where a rotation was fitted, what its error does over the distance of the pivots is not in these
+# tables: such pairs count only where the pivots are within a pixel.
+_ANSWERED = """
+    select image_id, technique, offset_dv_px as dv, offset_du_px as du, sigma_dv_px as sv, sigma_du_px as su,
+           rotation_deg as turn, pivot_v_px as pv, pivot_u_px as pu
+    from techniques where sigma_dv_px is not null and not coalesce(at_edge, false)
 """
 _PAIRS = """
-    select a.image_id, a.technique as first, b.technique as second,
-           a.offset_dv_px as dv_a, a.offset_du_px as du_a, b.offset_dv_px as dv_b, b.offset_du_px as du_b,
-           a.sigma_dv_px as sv_a, a.sigma_du_px as su_a, b.sigma_dv_px as sv_b, b.sigma_du_px as su_b,
-           a.rotation_deg as turn_a, b.rotation_deg as turn_b, a.pivot_v_px as pv_a, a.pivot_u_px as pu_a,
-           b.pivot_v_px as pv_b, b.pivot_u_px as pu_b
-    from techniques a join techniques b on a.image_id = b.image_id and a.technique < b.technique
-    where a.sigma_dv_px is not null and b.sigma_dv_px is not null and not coalesce(a.at_edge or b.at_edge, false)
-    order by a.image_id, first, second
+    with couples as (
+        select a.image_id, a.technique as first, b.technique as second, a.dv, a.du, a.sv, a.su, b.sv as sv_b,
+               b.su as su_b, radians(coalesce(b.turn, 0)) as theta, coalesce(b.pv - a.pv, 0) as v,
+               coalesce(b.pu - a.pu, 0) as u, b.dv as dv_b, b.du as du_b
+        from answered a join answered b on a.image_id = b.image_id and a.technique < b.technique
+        where (a.turn is null and b.turn is null) or (a.pv - b.pv) ** 2 + (a.pu - b.pu) ** 2 <= 1
+    )
+    select image_id, first, second, greatest(
+        abs(dv - dv_b - v + cos(theta) * v + sin(theta) * u) / sqrt(sv ** 2 + sv_b ** 2),
+        abs(du - du_b - u - sin(theta) * v + cos(theta) * u) / sqrt(su ** 2 + su_b ** 2)) as pull
+    from couples where sv + sv_b > 0 and su + su_b > 0
 """
+_STEPS = {"answered": _ANSWERED, "pairs": _PAIRS}
+_QUESTIONS = {
+    "answers": """
+        select image_id, mission || ' ' || camera as camera, time_utc, status, status_reason, rank, offset_dv_px,
+               offset_du_px, sigma_dv_px, sigma_du_px, rotation_deg,
+               sqrt((sigma_dv_px ** 2 + sigma_du_px ** 2) / 2) as sigma_px
+        from offsets order by image_id
+    """,
+    "stages": """
+        select stage, median(seconds) as median_s, quantile_cont(seconds, 0.95) as p95_s, sum(seconds) as total_s
+        from timings group by stage order by total_s desc, stage
+    """,
+    "slowest": """
+        select image_id, max(seconds) as seconds from timings where stage = 'total'
+        group by image_id order by seconds desc, image_id limit 12
+    """,
+    "failed": """
+        select status, status_reason as reason, count(*) as images, min_by(image_id, image_id, 20) as first_ids
+        from offsets where status != 'success' group by all order by images desc, reason
+    """,
+    "by_pair": f"""
+        select first || ' and ' || second as pair, count(*) as images, median(pull) as median, max(pull) as largest,
+               count_if(pull > {MOST_PULL}) as apart
+        from pairs group by first, second order by pair
+    """,
+    "worst_pairs": """
+        select image_id, first || ' and ' || second as pair, pull from pairs order by pull desc, image_id, pair limit 10
+    """,
+    "shown_pairs": f"""
+        select image_id, first || ' and ' || second as pair, pull, number from (
+            select *, row_number() over (order by image_id, first, second) - 1 as number, count(*) over () as total
+            from pairs
+        ) where number % ceil(total / {_SHOWN_PAIRS})::bigint = 0 order by number
+    """,
+    "conflicts": """
+        select image_id, max(pull) as strangeness from pairs semi join
+            (select image_id from offsets where status = 'conflicted') using (image_id)
+        group by image_id order by strangeness desc, image_id limit 12
+    """,
+    "field": f"""
+        with cells as (
+            select mission || ' ' || camera as seen_by, image_id, rows, columns from offsets where rows is not null
+        )
+        select seen_by as camera, floor({FIELD_CELLS} * (measured_v_px + 0.5) / rows) as row_cell,
+               floor({FIELD_CELLS} * (measured_u_px + 0.5) / columns) as column_cell, count(*) as features,
+               sum(residual_v_px / sigma_px ** 2) / sum(1 / sigma_px ** 2) as dv_px,
+               sum(residual_u_px / sigma_px ** 2) / sum(1 / sigma_px ** 2) as du_px,
+               1 / sqrt(sum(1 / sigma_px ** 2)) as sigma_px
+        from features join cells using (image_id)
+        where used and sigma_px > 0 and residual_v_px is not null and residual_u_px is not null
+            and measured_v_px between -0.5 and rows - 0.5 and measured_u_px between -0.5 and columns - 0.5
+        group by all order by all
+    """,
+}
 
 
 @dataclass(frozen=True)
@@ -48,15 +106,26 @@ class RunRows:
         Seconds.
     failed
         Reasons with the first image ids of each.
-    pairs
-        Two techniques on one image: ``pull``, their distance over the joint sigma of the worse axis.
+    by_pair
+        Figures of ``pull``, the distance of two techniques on one image over the joint sigma of the worse axis, by pair
+        of techniques.
+    worst_pairs, shown_pairs
+        Pairs with the largest pulls; evenly sampled ones.
+    conflicts
+        Images whose techniques contradict each other, with their largest pull.
+    field
+        Residuals of used features by camera and cell of the array, weighted.
     """
 
     answers: pd.DataFrame
     stages: pd.DataFrame
     slowest: pd.DataFrame
     failed: pd.DataFrame
-    pairs: pd.DataFrame
+    by_pair: pd.DataFrame
+    worst_pairs: pd.DataFrame
+    shown_pairs: pd.DataFrame
+    conflicts: pd.DataFrame
+    field: pd.DataFrame
 
 
 def collect(folder: RunFolder) -> RunRows:
@@ -77,36 +146,37 @@ def collect(folder: RunFolder) -> RunRows:
     ConfigurationError
         If the run has no tables.
     """
-    answers, stages, slowest, failed, pairs = (
-        ask(folder, question).to_pandas() for question in (_ANSWERS, _STAGES, _SLOWEST, _FAILED, _PAIRS)
+    answers = ask_many(folder, _STEPS, _QUESTIONS)
+    return RunRows(**{name: _frame(answers.pop(name)) for name in _QUESTIONS})
+
+
+def _frame(answer: pa.Table) -> pd.DataFrame:
+    """Rows for pandas; texts that repeat are kept once, and nothing is held twice."""
+    repeated = ("camera", "status", "status_reason", "rank")
+    return pd.DataFrame(
+        answer.to_pandas(categories=[name for name in repeated if name in answer.column_names], self_destruct=True)
     )
-    answers["sigma_px"] = np.sqrt((answers["sigma_dv_px"] ** 2 + answers["sigma_du_px"] ** 2) / 2.0)
-    answers["camera"] = answers["mission"].astype(str) + " " + answers["camera"].astype(str)
-    return RunRows(answers, stages, slowest, failed, _pulls(pairs))
 
 
-def _pulls(pairs: pd.DataFrame) -> pd.DataFrame:
-    """Disagreement of each pair about the first one's pivot.
+def collect_answers(folder: RunFolder) -> pd.DataFrame:
+    """One row per image of another run, to compare with.
 
-    Where a rotation was fitted, what its error does over the distance of the pivots is not in these tables: such pairs
-    count only where the pivots are within a pixel.
+    Parameters
+    ----------
+    folder
+        The run.
+
+    Returns
+    -------
+    pandas.DataFrame
+        As ``answers`` of :class:`RunRows`.
+
+    Raises
+    ------
+    ConfigurationError
+        If the run has no tables.
     """
-    turn = np.radians(pairs["turn_b"].fillna(0.0).to_numpy(float))
-    places = pairs[["pv_b", "pu_b", "pv_a", "pu_a"]].to_numpy(float)
-    moved = np.array(
-        [
-            move_pivot(np.array([dv, du]), theta, place[:2], place[2:])[0]
-            for dv, du, theta, place in zip(pairs["dv_b"], pairs["du_b"], turn, places, strict=True)
-        ]
-    ).reshape(-1, 2)
-    difference = pairs[["dv_a", "du_a"]].to_numpy(float) - moved
-    joint = np.hypot(pairs[["sv_a", "su_a"]].to_numpy(float), pairs[["sv_b", "su_b"]].to_numpy(float))
-    pulls = pairs.assign(pull=np.abs(difference / joint).max(axis=1) if len(pairs) else [])
-    fixed = pairs["turn_a"].isna() & pairs["turn_b"].isna()
-    near = np.hypot(places[:, 0] - places[:, 2], places[:, 1] - places[:, 3]) <= 1.0
-    kept = pulls[(fixed | near) & np.isfinite(pulls["pull"])]
-    named: pd.DataFrame = kept.assign(pair=kept["first"] + " and " + kept["second"])
-    return named
+    return _frame(ask_many(folder, {}, {"answers": _QUESTIONS["answers"]})["answers"])
 
 
 def strangest(answers: pd.DataFrame, most: int = 12) -> pd.DataFrame:
@@ -127,10 +197,11 @@ def strangest(answers: pd.DataFrame, most: int = 12) -> pd.DataFrame:
     solved = answers.dropna(subset=["offset_dv_px", "offset_du_px"]).copy()
     worst = np.zeros(len(solved))
     for column in ("offset_dv_px", "offset_du_px"):
-        middle = solved.groupby("camera")[column].transform("median")
-        spread = 1.4826 * (solved[column] - middle).abs().groupby(solved["camera"]).transform("median")
+        middle = solved.groupby("camera", observed=True)[column].transform("median")
+        off = (solved[column] - middle).abs()
+        spread = 1.4826 * off.groupby(solved["camera"], observed=True).transform("median")
         own = np.hypot(spread, solved["sigma_px"])
-        worst = np.maximum(worst, ((solved[column] - middle).abs() / np.maximum(own, 1e-6)).to_numpy(float))
+        worst = np.maximum(worst, (off / np.maximum(own, 1e-6)).to_numpy(float))
     found: pd.DataFrame = solved.assign(strangeness=worst).nlargest(most, "strangeness", keep="first")
     return found
 
