@@ -38,6 +38,10 @@ class LandmarkStateOptions(Options):
     )
     outlier_chance: float = Field(1e-3, gt=0, lt=0.5, description="chance by which a good landmark is rejected")
     least_landmarks: int = Field(4, ge=1, description="landmarks that must remain")
+    common_sigma_px: float = Field(
+        0.03, ge=0, le=10,
+        description="1 sigma per axis of a shift that all landmarks of a picture share, as shading pulls them sunward",
+    )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,6 +204,7 @@ class _Sums:
     alone: FloatArray
     right: FloatArray
     considered: FloatArray
+    shared: FloatArray
     distance2: FloatArray
 
 
@@ -220,7 +225,10 @@ def _normal_equations(
     )
     right = np.einsum("nia,nij,nj->a", partials, weights, residual) + prior @ behind
     considered = np.einsum("nia,nij,njk,nkl,nlb->ab", partials, weights, from_place, weights, partials)
-    return _Sums(alone + prior, alone, right, considered, np.einsum("ni,nij,nj->n", residual, total, residual))
+    shift = np.einsum("nia,nij->aj", partials, weights)
+    shared = options.common_sigma_px**2 * shift @ shift.T
+    distance2 = np.einsum("ni,nij,nj->n", residual, total, residual)
+    return _Sums(alone + prior, alone, right, considered, shared, distance2)
 
 
 def _prior_information(covariance: FloatArray, camera_from_body: FloatArray) -> FloatArray:
@@ -243,9 +251,10 @@ def _into_body(camera_from_body: FloatArray) -> FloatArray:
 
 
 def _covariance(sums: _Sums, now: MapletView, options: LandmarkStateOptions) -> FloatArray:
-    covariance = np.linalg.pinv(sums.normal, hermitian=True)
+    plain = np.linalg.pinv(sums.normal, hermitian=True)
+    covariance = plain + plain @ sums.shared @ plain
     if options.landmark_errors == "consider":
-        covariance = covariance + covariance @ sums.considered @ covariance
+        covariance = covariance + plain @ sums.considered @ plain
     turn = _into_body(now.camera_from_body)
     return np.asarray(turn @ covariance @ turn.T)
 

@@ -47,6 +47,9 @@ class SurfaceFeatureOptions(TechniqueOptions):
     fit: StarFitOptions = StarFitOptions()
     most_landmarks: int = Field(120, ge=4, le=5000, description="maplets looked for in one picture, at most")
     least_landmarks: int = Field(4, ge=1, description="landmarks that must agree")
+    least_confidence: float = Field(
+        0.99, ge=0, lt=1, description="one minus the expected number of places on which as many agree by luck, at least"
+    )
     rounds: int = Field(2, ge=1, le=5, description="times that all landmarks are looked for, geometry renewed between")
     state: LandmarkStateOptions = LandmarkStateOptions()
     position_sigma_share: float = Field(
@@ -228,7 +231,7 @@ def _state(
         found_state, moved = updated, updated.view.pixels(table.landmark_km)[0]
         if np.abs(moved - places).max() < options.state_tolerance_px:
             break
-        places, table = moved, _looked_for(search, before, updated.view, (0.0, 1))
+        places, table = moved, _looked_for(search, before, updated.view, (0.0, 2))
     return found_state
 
 
@@ -300,10 +303,14 @@ def _answer(
     if agreeing < options.least_landmarks:
         detail = f"{body.name}: {agreeing} of {len(table)} landmarks agree"
         return TechniqueFailure(NAME, StatusReason.NO_MATCH, detail)
+    confidence = _confidence(agreeing, table, context)
+    if confidence < options.least_confidence:
+        detail = f"{body.name}: {agreeing} of {len(table)} landmarks agree, as they may by luck"
+        return TechniqueFailure(NAME, StatusReason.NO_MATCH, detail)
     at_edge, at_edge_rotation = edge_flags(fit.centre_offset_vu, fit.rotation_rad, context, options)
     return TechniqueResult(
         technique=NAME, offset_vu=fit.offset_vu, rotation_rad=fit.rotation_rad, information=fit.information,
-        pivot_vu=fit.pivot_vu, confidence=_confidence(agreeing, table, context), measurements=agreeing,
+        pivot_vu=fit.pivot_vu, confidence=confidence, measurements=agreeing,
         at_edge=at_edge, at_edge_rotation=at_edge_rotation, error_sources=(f"body:{body.name}",),
         diagnostics={
             "landmarks_used": int(fit.inlier.sum()), "landmarks_looked_for": len(table),

@@ -74,6 +74,7 @@ def trial(
     # body_from_camera_true = Exp(r) body_from_camera_est, p_est = p_true + dp.
     start = replace(VIEW, position_km=VIEW.position_km + error[:3], camera_from_body=TURN @ exp(error[3:]))
     observed = VIEW.pixels(true_place)[0] + rng.normal(size=(count, 2)) * [0.1, 0.2]
+    observed += rng.normal(size=2) * LandmarkStateOptions().common_sigma_px
     observed[:outliers] += rng.choice([-1, 1], (outliers, 2)) * rng.uniform(5, 30, (outliers, 2))
     noise = np.broadcast_to(np.diag([0.01, 0.04]), (count, 2, 2))
     place_noise = np.broadcast_to(np.eye(3) * landmark_km**2, (count, 3, 3))
