@@ -115,7 +115,7 @@ def _text(names: tuple[str, ...] | list[str]) -> str:
     return ", ".join(names)
 
 
-def read_matches(data: bytes, name: str) -> MatchTable:
+def read_matches(data: bytes, name: str, one_view: bool = False) -> MatchTable:
     """Read and check a table of matches.
 
     Parameters
@@ -125,6 +125,8 @@ def read_matches(data: bytes, name: str) -> MatchTable:
         ``x_km, y_km, z_km`` and ``cov_xx_km2`` ... ``cov_zz_km2``.
     name
         For messages.
+    one_view
+        Whether all rows are of one view, which then need not be named.
 
     Returns
     -------
@@ -134,12 +136,16 @@ def read_matches(data: bytes, name: str) -> MatchTable:
     Raises
     ------
     ConfigurationError
-        If the file cannot be read, a column is missing or of the wrong kind, or it has no rows.
+        If the file cannot be read, a column is missing or of the wrong kind, it has no rows, or more views than one.
     """
     try:
         table = pd.read_parquet(BytesIO(data))
     except (pa.ArrowException, OSError, ValueError) as error:
         raise ConfigurationError(f"{name}: no Parquet table ({str(error).splitlines()[0]})") from error
+    if one_view:
+        if "view_id" in table and table["view_id"].nunique() > 1:
+            raise ConfigurationError(f"{name}: matches of more than one view")
+        table = table.assign(view_id=0)
     missing = [column for column in _REQUIRED if column not in table]
     if missing:
         raise ConfigurationError(f"{name}: no column {_text(missing)}; matches need {_text(_REQUIRED)}")
@@ -157,6 +163,32 @@ def read_matches(data: bytes, name: str) -> MatchTable:
         ids[0], ids[1], pixels, None if pixel is None else _symmetric(pixel, 2), places,
         None if point is None else _symmetric(point, 3),
     )  # fmt: skip
+
+
+def read_image_matches(data: bytes, name: str) -> MatchTable:
+    """Read the matches of one image, which lie beside it or come from another program.
+
+    Parameters
+    ----------
+    data
+        A Parquet file as for :func:`read_matches`; ``view_id`` is not needed, places of the points are.
+    name
+        For messages.
+
+    Returns
+    -------
+    MatchTable
+        Its rows in their order, all of view 0.
+
+    Raises
+    ------
+    ConfigurationError
+        If it is no such file, or of several views.
+    """
+    found = read_matches(data, name, one_view=True)
+    if found.points_km is None:
+        raise ConfigurationError(f"{name}: no column {_text(_PLACE)}; matches of one image need places of its points")
+    return found
 
 
 def _integers(table: pd.DataFrame, column: str, name: str) -> NDArray[np.int64]:

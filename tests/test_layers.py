@@ -23,7 +23,7 @@ LEVELS = (
     ("ensemble",),
     ("navigate",),
     ("curate",),
-    ("tables",),
+    ("tables", "pose_documents"),
 )
 # Within a folder: modules that the others of it may import, lowest first. All others are equals.
 FOUNDATIONS = {
@@ -37,7 +37,7 @@ FOUNDATIONS = {
     "techniques": (
         "base", "star_fit", "star_match", "star_search", "star_inventory", "body_base", "body_search", "model_errors",
         "template_fit", "body_minor", "contour_fit", "limb_albedo", "lm", "line_search", "relief",
-        "ring_units", "ring_solve", "ring_fit", "ring_search", "ring_answer",
+        "ring_units", "ring_solve", "ring_texture", "ring_fit", "ring_search", "ring_answer",
         "maplet_correlation", "maplet_alignment", "landmark_table", "landmark_state",
     ),
 }  # fmt: skip

@@ -1,10 +1,14 @@
 """Running a plan: in this process, on a local Dask cluster, or on one that is there. The only importer of Dask."""
 
 import logging
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import CancelledError
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import islice
+from typing import TypeVar
 from uuid import uuid4
 
 import dask
@@ -21,6 +25,8 @@ from workflows.store import to_json, write_atomically
 from workflows.task import ImageRunner, Outcome, lost_document
 
 Listener = Callable[[Outcome], None]
+_Item = TypeVar("_Item")
+_Answer = TypeVar("_Answer")
 # Tasks waiting per worker: enough that none ever idles, few enough that a killed run wastes nothing.
 _IN_FLIGHT_PER_WORKER = 6
 _CONNECT_TIMEOUT_S = 10
@@ -129,6 +135,61 @@ def _run_on(client: Client, plan: Plan, on_done: Listener, on_ready: Callable[[s
             client.unregister_worker_plugin(plugin.name)
     except CommClosedError as error:
         raise PilotageError("the scheduler is gone; run the same command again to go on") from error
+
+
+def map_in_order(
+    function: Callable[[_Item], _Answer], items: Sequence[_Item], options: ClusterOptions
+) -> Iterator[_Answer | None]:
+    """Apply a function to items on workers, answers in the order of the items and no more of them held than in flight.
+
+    Parameters
+    ----------
+    function
+        Of a module, so that workers can import it.
+    items
+        Small: they travel.
+    options
+        Where.
+
+    Yields
+    ------
+    object or None
+        Answers; None for an item whose worker died, and died again when it was tried alone.
+
+    Raises
+    ------
+    ConfigurationError
+        If there is no such scheduler, it has no workers, or the memory limit is no size or too small.
+    """
+    if options.workers == 0 and options.scheduler is None:
+        yield from map(function, items)
+        return
+    with _client(options) as client:
+        _await_workers(client)
+        count = len(client.scheduler_info(n_workers=-1)["workers"])
+        waiting, flying = iter(items), deque[tuple[_Item, Future]]()
+        for item in islice(waiting, 2 * max(count, 1)):
+            flying.append((item, client.submit(function, item, pure=False)))
+        while flying:
+            item, future = flying.popleft()
+            answer = _answer_of(future)
+            if answer is None:
+                answer = _answer_of(client.submit(function, item, pure=False))
+            future.release()
+            for following in islice(waiting, 1):
+                flying.append((following, client.submit(function, following, pure=False)))
+            yield answer
+
+
+def _answer_of(future: Future) -> _Answer | None:
+    """Result of a task, None if its worker died."""
+    try:
+        answer: _Answer = future.result()
+    except (KilledWorker, CancelledError):
+        return None
+    except CommClosedError as error:
+        raise PilotageError("the scheduler is gone; run the same command again") from error
+    return answer
 
 
 def _await_workers(client: Client) -> None:

@@ -83,10 +83,12 @@ class Budget:
 
 @dataclass(frozen=True)
 class PoseRow:
-    """Answer for one view; ``answer`` is the failure where there is no pose."""
+    """Answer for one view; ``answer`` is the failure where there is no pose. Clocks are for the table of timings."""
 
     view_id: int
     answer: PoseEstimate | PnpFailureError
+    seconds: float = 0.0
+    emitted_at_ns: int | None = None
 
 
 @dataclass(frozen=True)
@@ -204,7 +206,10 @@ def solve_views(views: Views, budget: Budget, every: bool) -> Iterable[PoseRow]:
             # The log has a line per throttled frame; Python's own warnings would say the first one only.
             warnings.simplefilter("ignore", CovarianceDegradedWarning)
             state = budget.state(started, int(view_id) in views.throttled)
-            yield PoseRow(int(view_id), solve_view(estimator, views.calibration, matches, state))
+            begun = time.monotonic()
+            answer = solve_view(estimator, views.calibration, matches, state)
+        emitted = time.monotonic_ns() if isinstance(answer, PoseEstimate) else None
+        yield PoseRow(int(view_id), answer, time.monotonic() - begun, emitted)
 
 
 def bundle_views(views: Views, rows: list[PoseRow], sigma_km: float, sigma_rad: float) -> list[PoseRow]:
@@ -231,7 +236,7 @@ def bundle_views(views: Views, rows: list[PoseRow], sigma_km: float, sigma_rad: 
     spread = np.diag([sigma_km**2] * 3 + [sigma_rad**2] * 3)
     priors = {view: PosePrior(pose, spread) for view, pose in views.given.items()}
     bundle = adjust(camera, views.sightings, starts, places, priors, sigma)
-    return [PoseRow(row.view_id, _adjusted(views, bundle, row)) for row in rows]
+    return [replace(row, answer=_adjusted(views, bundle, row)) for row in rows]
 
 
 def _adjusted(views: Views, bundle: Bundle, row: PoseRow) -> PoseEstimate | PnpFailureError:

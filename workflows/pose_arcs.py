@@ -1,6 +1,7 @@
 """Arcs after the images: tables ``poses`` and ``arcs``."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import pyarrow as pa
@@ -22,18 +23,47 @@ from pipeline.pose.records import (
     SourceLabel,
     frame_id_of,
 )
-from pipeline.pose.schemas import ARC_SCHEMA, POSE_SCHEMA, UPPER
+from pipeline.pose.schemas import UPPER
 from pipeline.records import FloatArray
 from workflows.pose import PoseRow
 
 Row = dict[str, str | int | float | bool | None]
 
-def smooth(arcs: Sequence[Arc], rows: Sequence[PoseRow], calibration: CameraCalibration) -> tuple[pa.Table, pa.Table]:
-    """Smooth every arc.
+
+@dataclass(frozen=True)
+class ArcIdentity:
+    """What an arc is called and whose it is; mission and camera are None in a file of matches."""
+
+    arc_id: str
+    body: str
+    mission: str | None = None
+    camera: str | None = None
+
+
+@dataclass(frozen=True)
+class ArcMember:
+    """One image of an arc with what its own matches gave; ``answer`` is None for an image without matches."""
+
+    image: ArcImage
+    answer: PoseEstimate | PnpFailureError | None
+    calibration: CameraCalibration
+    view_id: int | None = None
+
+
+@dataclass(frozen=True)
+class SmoothedArc:
+    """Rows of tables ``poses`` and ``arcs``."""
+
+    poses: list[Row]
+    summary: Row
+
+
+def members_of(arc: Arc, rows: Sequence[PoseRow], calibration: CameraCalibration) -> list[ArcMember]:
+    """Views of a file's arc with the poses that they had alone.
 
     Parameters
     ----------
-    arcs
+    arc
         Of the cameras' file.
     rows
         Views solved alone.
@@ -42,44 +72,114 @@ def smooth(arcs: Sequence[Arc], rows: Sequence[PoseRow], calibration: CameraCali
 
     Returns
     -------
-    tuple of pyarrow.Table
-        ``poses`` and ``arcs``.
+    list of ArcMember
+        In the order of the arc.
+    """
+    answers = {row.view_id: row.answer for row in rows}
+    return [
+        ArcMember(
+            ArcImage(str(view.view_id), view.et, view.prior, fix_of(answers.get(view.view_id))),
+            answers.get(view.view_id), calibration, view.view_id,
+        )
+        for view in arc.views
+    ]  # fmt: skip
+
+
+@dataclass(frozen=True)
+class ArcJobOfFile:
+    """One arc of a cameras' file, for a worker."""
+
+    identity: ArcIdentity
+    members: list[ArcMember]
+    options: ArcOptions
+
+    @staticmethod
+    def of(arc: Arc, rows: Sequence[PoseRow], calibration: CameraCalibration) -> "ArcJobOfFile":
+        """Arc of a file with the poses that its views had alone."""
+        identity = ArcIdentity(arc.arc_id, calibration.datum.name)
+        return ArcJobOfFile(identity, members_of(arc, rows, calibration), options_of(arc.arc_id, arc.options))
+
+
+def solve_arc_of_file(job: ArcJobOfFile) -> SmoothedArc:
+    """Smooth one arc of a file."""
+    return smooth_members(job.identity, job.members, job.options)
+
+
+def timing_rows(rows: Sequence[PoseRow]) -> list[Row]:
+    """Rows of table ``timings`` of views solved alone."""
+    return [
+        {
+            "image_id": str(row.view_id), "stage": "pose", "seconds": row.seconds, "emitted_at_ns": row.emitted_at_ns,
+        }
+        for row in rows
+    ]  # fmt: skip
+
+
+def fix_of(answer: PoseEstimate | PnpFailureError | None) -> PosePrior | None:
+    """What an image's own pose says in its arc."""
+    return PosePrior(answer.pose, answer.covariance_6x6) if isinstance(answer, PoseEstimate) else None
+
+
+def smooth_members(identity: ArcIdentity, members: Sequence[ArcMember], options: ArcOptions) -> SmoothedArc:
+    """Smooth one arc.
+
+    Parameters
+    ----------
+    identity
+        Its name.
+    members
+        Its images in the order of time.
+    options
+        Uncertainties.
+
+    Returns
+    -------
+    SmoothedArc
+        A row per image and one for the arc.
 
     Raises
     ------
     ConfigurationError
-        If an arc is none, or its options are not.
+        If the arc is none.
     """
-    answers = {row.view_id: row.answer for row in rows}
-    poses: list[Row] = []
-    summary: list[Row] = []
-    for arc in arcs:
-        try:
-            result = smooth_arc(
-                [_image(view.view_id, view.et, view.prior, answers) for view in arc.views], _options(arc)
-            )
-        except MatchError as error:
-            raise ConfigurationError(f"arc {arc.arc_id}: {error}") from error
-        for k, view in enumerate(arc.views):
-            poses.append(_pose_row(arc, view.view_id, view.et, k, result, answers.get(view.view_id), calibration))
-        summary.append(_arc_row(arc, result, [row for row in poses if row["arc_id"] == arc.arc_id]))
-    return pa.Table.from_pylist(poses, schema=POSE_SCHEMA), pa.Table.from_pylist(summary, schema=ARC_SCHEMA)
-
-
-def _options(arc: Arc) -> ArcOptions:
     try:
-        return ArcOptions.model_validate(arc.options)
+        result = smooth_arc([member.image for member in members], options)
+    except MatchError as error:
+        raise ConfigurationError(f"arc {identity.arc_id}: {error}") from error
+    poses = [_pose_row(identity, member, k, result) for k, member in enumerate(members)]
+    return SmoothedArc(poses, _arc_row(identity, members, result))
+
+
+def table_of(rows: Sequence[Row], schema: pa.Schema) -> pa.Table:
+    """Arrow table of rows; a column that a row does not name is null."""
+    return pa.Table.from_pylist(list(rows), schema=schema)
+
+
+def options_of(arc_id: str, told: Mapping[str, object]) -> ArcOptions:
+    """Uncertainties of an arc.
+
+    Parameters
+    ----------
+    arc_id
+        For the message.
+    told
+        Fields of ``ArcOptions``.
+
+    Returns
+    -------
+    ArcOptions
+        With defaults for the rest.
+
+    Raises
+    ------
+    ConfigurationError
+        If there is no such field, or a value is out of its bounds.
+    """
+    try:
+        return ArcOptions.model_validate(told)
     except ValidationError as error:
         first = error.errors()[0]
-        raise ConfigurationError(
-            f"arc {arc.arc_id}: options.{'.'.join(map(str, first['loc']))}: {first['msg']}"
-        ) from error
-
-
-def _image(view_id: int, et: float, prior: Pose, answers: dict[int, PoseEstimate | PnpFailureError]) -> ArcImage:
-    answer = answers.get(view_id)
-    fix = PosePrior(answer.pose, answer.covariance_6x6) if isinstance(answer, PoseEstimate) else None
-    return ArcImage(str(view_id), et, prior, fix)
+        raise ConfigurationError(f"arc {arc_id}: options.{'.'.join(map(str, first['loc']))}: {first['msg']}") from error
 
 
 def _numbers(prefix: str, pose: Pose, covariance: FloatArray) -> Row:
@@ -89,24 +189,18 @@ def _numbers(prefix: str, pose: Pose, covariance: FloatArray) -> Row:
     return row | {f"{prefix}cov_{i}{j}": float(covariance[i, j]) for i, j in UPPER}
 
 
-def _pose_row(
-    arc: Arc,
-    view_id: int,
-    et: float,
-    index: int,
-    result: ArcResult,
-    answer: PoseEstimate | PnpFailureError | None,
-    calibration: CameraCalibration,
-) -> Row:
-    pose = result.pose(index)
-    place = place_of(pose, calibration)
+def _pose_row(identity: ArcIdentity, member: ArcMember, index: int, result: ArcResult) -> Row:
+    pose, image, answer = result.pose(index), member.image, member.answer
+    place = place_of(pose, member.calibration)
     row: Row = {
-        "arc_id": arc.arc_id, "view_id": view_id, "frame_id": str(frame_id_of(str(view_id))), "et": et,
+        "image_id": image.image_id, "mission": identity.mission, "camera": identity.camera, "arc_id": identity.arc_id,
+        "body": identity.body, "view_id": member.view_id, "frame_id": str(frame_id_of(image.image_id)), "et": image.et,
         "label": result.label[index].value, "last_satellite_anchor_age_ms": result.anchor_age_ms[index],
         "lat_deg": place.lat_deg, "lon_deg": place.lon_deg, "alt_m": place.alt_m,
         "ellipsoidal_m": place.ellipsoidal_m, "datum": place.datum, "outlier": False,
+        "offset_used": None if image.offset is None else bool(result.offset_used[index]),
     }  # fmt: skip
-    vehicle = vehicle_orientation(pose, calibration)
+    vehicle = vehicle_orientation(pose, member.calibration)
     row |= {f"vehicle_q{part}": float(vehicle[k]) for k, part in enumerate("wxyz")}
     row |= _numbers("", pose, result.covariance[index])
     if isinstance(answer, PoseEstimate):
@@ -121,10 +215,15 @@ def _pose_row(
     return row
 
 
-def _arc_row(arc: Arc, result: ArcResult, poses: list[Row]) -> Row:
+def _arc_row(identity: ArcIdentity, members: Sequence[ArcMember], result: ArcResult) -> Row:
     sigma = np.sqrt(np.diag(result.bias_covariance_rad2))
     row: Row = {
-        "arc_id": arc.arc_id, "images": len(result.label), "outliers": sum(bool(row["outlier"]) for row in poses),
+        "arc_id": identity.arc_id, "mission": identity.mission, "camera": identity.camera, "body": identity.body,
+        "start_et": members[0].image.et, "stop_et": members[-1].image.et, "images": len(members),
+        "outliers": sum(
+            member.image.fix is not None and not used for member, used in zip(members, result.used, strict=True)
+        ),
+        "offsets_used": int(result.offset_used.sum()),
         "anchored": result.label.count(SourceLabel.SATELLITE_ANCHORED),
         "propagated": result.label.count(SourceLabel.VISUAL_PROPAGATED),
         "dead_reckoned": result.label.count(SourceLabel.DEAD_RECKONED),

@@ -5,7 +5,7 @@ import json
 import os
 import re
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -279,21 +279,58 @@ def _partition(mission: str, camera: str) -> str:
     return f"mission={quote(mission, safe='')}/camera={quote(camera, safe='')}"
 
 
-def _write_partition(folder: RunFolder, table: str, mission: str, camera: str, image_ids: Sequence[str]) -> None:
-    """One Parquet file; mission and camera live in its path, as hive partitions do."""
+def partition_file(folder: RunFolder, table: str, mission: str, camera: str) -> Path:
+    """Where a table's rows of one camera are.
+
+    Parameters
+    ----------
+    folder
+        The run.
+    table, mission, camera
+        Which.
+
+    Returns
+    -------
+    pathlib.Path
+        The Parquet file.
+    """
+    return folder.root / table / _partition(mission, camera) / f"{table}.parquet"
+
+
+@contextmanager
+def table_writer(folder: RunFolder, table: str, mission: str, camera: str) -> Iterator[Callable[[pa.Table], None]]:
+    """Write a table's rows of one camera, part by part; mission and camera live in the path, as hive partitions do.
+
+    Parameters
+    ----------
+    folder
+        The run.
+    table, mission, camera
+        Which.
+
+    Yields
+    ------
+    callable
+        Takes rows with the columns of the schema, and writes them as a row group.
+    """
     names = [name for name in SCHEMAS[table].names if name not in ("mission", "camera")]
     version = {VERSION_KEY: str(SCHEMA_VERSION).encode()}
     metadata = version | (SCHEMAS[table].metadata or {})
     schema = pa.schema([SCHEMAS[table].field(name) for name in names], metadata=metadata)
-    target = folder.root / table / _partition(mission, camera) / f"{table}.parquet"
+    target = partition_file(folder, table, mission, camera)
     target.parent.mkdir(parents=True, exist_ok=True)
     temporary = target.with_name(f".{target.name}.{uuid4().hex}")
     with pq.ParquetWriter(temporary, schema, compression="zstd") as writer:
+        yield lambda rows: writer.write_table(pa.Table.from_arrays([rows[name] for name in names], schema=schema))
+    os.replace(temporary, target)
+
+
+def _write_partition(folder: RunFolder, table: str, mission: str, camera: str, image_ids: Sequence[str]) -> None:
+    with table_writer(folder, table, mission, camera) as write:
         for start in range(0, len(image_ids), _IMAGES_PER_GROUP):
             columns = _columns(folder, table, image_ids[start : start + _IMAGES_PER_GROUP])
-            arrays = [pa.array(columns[name], type=schema.field(name).type) for name in names]
-            writer.write_table(pa.Table.from_arrays(arrays, schema=schema))
-    os.replace(temporary, target)
+            schema = SCHEMAS[table]
+            write(pa.table([pa.array(columns[field.name], type=field.type) for field in schema], schema=schema))
 
 
 def _columns(folder: RunFolder, table: str, image_ids: Iterable[str]) -> dict[str, list[Json]]:
