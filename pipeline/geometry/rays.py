@@ -5,6 +5,7 @@ single precision rounded outward, so that a ray opens the nearer one first. Patc
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numba
 import numpy as np
@@ -26,6 +27,14 @@ _EDGE = 1e-12
 # Splits by area may be lopsided; below this depth ranges are halved, so that no tree is deeper than the stack.
 _LOPSIDED_DEPTH = 32
 _STACK = 64
+
+
+class _Boxes(NamedTuple):
+    """Boxes of primitives, (n, 3) lowest and highest corners, and the order in which they are taken."""
+
+    low: FloatArray
+    high: FloatArray
+    order: IntArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,7 +116,7 @@ def make_tree(corners_km: FloatArray) -> RayTree:
     nodes = max(len(corners_km), 1)
     boxes = np.empty((nodes, 2, 6), np.float32)
     children = np.empty((nodes, 2), np.int32)
-    used = _build(low, high, order, boxes, children, _LEAF[corners_km.shape[1]])
+    used = _build(_Boxes(low, high, order), boxes, children, _LEAF[corners_km.shape[1]])
     return RayTree(corners_km[order], order, boxes[:used], children[:used])
 
 
@@ -137,12 +146,12 @@ def cast(tree: RayTree, origins_km: FloatArray, directions: FloatArray) -> tuple
 
 
 @numba.njit(cache=True, nogil=True)
-def _build(low, high, order, boxes, children, leaf):  # type: ignore[no-untyped-def]
-    """Fill nodes from the root on; returns how many. ``order`` becomes the order of the leaves."""
+def _build(primitives, boxes, children, leaf):  # type: ignore[no-untyped-def]
+    """Fill nodes from the root on; returns how many. The primitives' order becomes that of the leaves."""
     stack = np.empty((2 * _STACK, 5), np.int64)
     used = 1
     # Also a lone primitive gets a root; its other child is empty.
-    _split_into(low, high, order, boxes, children, 0, 0, len(order), stack, 0, 1)
+    _split_into(primitives, boxes, 0, 0, len(primitives.order), stack, 0, 1)
     top = 2
     while top > 0:
         top -= 1
@@ -151,26 +160,27 @@ def _build(low, high, order, boxes, children, leaf):  # type: ignore[no-untyped-
             children[node, side] = -(first * _LEAF_BASE + count) - 1
             continue
         children[node, side] = used
-        _split_into(low, high, order, boxes, children, used, first, count, stack, top, depth + 1)
+        _split_into(primitives, boxes, used, first, count, stack, top, depth + 1)
         used += 1
         top += 2
     return used
 
 
 @numba.njit(cache=True, nogil=True)
-def _split_into(low, high, order, boxes, children, node, first, count, stack, top, depth):  # type: ignore[no-untyped-def]
+def _split_into(primitives, boxes, node, first, count, stack, top, depth):  # type: ignore[no-untyped-def]
     """Divide a range of primitives between the two children of a node and push both."""
-    left = _partition(low, high, order, first, count) if depth < _LOPSIDED_DEPTH else count // 2
+    left = _partition(primitives, first, count) if depth < _LOPSIDED_DEPTH else count // 2
     for side in range(2):
         start = first if side == 0 else first + left
         size = left if side == 0 else count - left
-        _bound(low, high, order, start, size, boxes, node, side)
+        _bound(primitives, start, size, boxes, node, side)
         entry = stack[top + side]
         entry[0], entry[1], entry[2], entry[3], entry[4] = start, size, node, side, depth
 
 
 @numba.njit(cache=True, nogil=True)
-def _bound(low, high, order, start, size, boxes, node, side):  # type: ignore[no-untyped-def]
+def _bound(primitives, start, size, boxes, node, side):  # type: ignore[no-untyped-def]
+    low, high, order = primitives
     for k in range(3):
         a, b = np.inf, -np.inf
         for i in range(start, start + size):
@@ -187,10 +197,11 @@ def _area(box):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def _partition(low, high, order, first, count):  # type: ignore[no-untyped-def]
+def _partition(primitives, first, count):  # type: ignore[no-untyped-def]
     """Reorder a range so that its cheapest split by surface area stands in two parts; length of the first."""
     if count < 2:
         return count
+    low, high, order = primitives
     middle_low, middle_high = np.full(3, np.inf), np.full(3, -np.inf)
     for i in range(first, first + count):
         for k in range(3):
@@ -202,7 +213,7 @@ def _partition(low, high, order, first, count):  # type: ignore[no-untyped-def]
         width = middle_high[axis] - middle_low[axis]
         if width <= 0.0:
             continue
-        _bin_costs(low, high, order, first, count, axis, middle_low[axis], _BINS / width, cost)
+        _bin_costs(primitives, first, count, axis, middle_low[axis], _BINS / width, cost)
         for k in range(_BINS - 1):
             if cost[k] < best:
                 best, best_axis, best_bin = cost[k], axis, k
@@ -222,8 +233,9 @@ def _partition(low, high, order, first, count):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def _bin_costs(low, high, order, first, count, axis, start, scale, cost):  # type: ignore[no-untyped-def]
+def _bin_costs(primitives, first, count, axis, start, scale, cost):  # type: ignore[no-untyped-def]
     """Cost of a split behind each bin: area times number of primitives on both sides."""
+    low, high, order = primitives
     boxes = np.empty((_BINS, 6))
     numbers = np.zeros(_BINS, np.int64)
     boxes[:, :3], boxes[:, 3:] = np.inf, -np.inf

@@ -125,10 +125,9 @@ def predict_image(
         (n, n) relative light, zero in shadow; (n, n) True where height and albedo are known and the Sun shines.
     """
     phase = float(np.arccos(np.clip(sun @ ray, -1.0, 1.0)))
-    law, parameter, factor = law_of_maplet(options.law, phase)
     light = np.zeros(maplet.heights.shape)
     lit = np.zeros(light.shape, np.bool_)
-    _shade(maplet.heights, maplet.albedo, sun, ray, law, parameter, factor, light, lit)
+    _shade(maplet.heights, maplet.albedo, sun, ray, law_of_maplet(options.law, phase), light, lit)
     if options.cast_shadows:
         lit &= ~blocked_cells(maplet.heights, sun)
         light[~lit] = 0.0
@@ -154,7 +153,8 @@ def _normal(heights, i, j):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def _shade(heights, albedo, sun, ray, law, parameter, factor, light, lit):  # type: ignore[no-untyped-def]
+def _shade(heights, albedo, sun, ray, scattering, light, lit):  # type: ignore[no-untyped-def]
+    law, parameter, factor = scattering
     for i in range(heights.shape[0]):
         for j in range(heights.shape[0]):
             x, y, z = _normal(heights, i, j)
