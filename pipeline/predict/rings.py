@@ -13,11 +13,12 @@ from pipeline.imaging.render import RayGrid, Window, ray_grid
 from pipeline.imaging.ring_light import profile_image
 from pipeline.options import Options
 from pipeline.predict.bodies import reach_px
-from pipeline.records import BoolArray, FloatArray, Image, Record, RingKind, RingSystem, State
+from pipeline.records import BoolArray, FloatArray, Image, Record, RingFeature, RingKind, RingSystem, State
 
 _SAMPLES = 2048
 # Optical depth of a ring of which nobody says it, and least optical depth that counts as a ring.
 _USUAL_TAU, _LEAST_TAU = 1.0, 1e-4
+_SMALL_CHANGE = 1e-3
 _CANVAS_SKY_PX = 24
 # Nearer to the plane than this (sine of the opening) the rings are a line.
 _EDGE_ON = 2e-3
@@ -107,6 +108,8 @@ class RingScene:
         (n, 2048) radius as seen in the plane over longitude.
     contrasts
         (n,) predicted light outside less inside, in units of the largest.
+    unevenness
+        (n,) how much of its contrast the light beside an edge changes by for a relative change of the optical depth.
     fates
         Every feature.
     rays
@@ -127,6 +130,7 @@ class RingScene:
     sigma_km: FloatArray
     curves: FloatArray
     contrasts: FloatArray
+    unevenness: FloatArray
     fates: tuple[RingFate, ...]
     rays: RayGrid | None
     forms: FloatArray = field(default_factory=lambda: np.zeros((0, 12)))
@@ -244,7 +248,7 @@ def predict_rings(state: State, sigma_px: float, options: RingPredictionOptions)
     rings, reach = state.rings, reach_px(state)
     nothing = RingScene(
         state, rings, reach, sigma_px, np.zeros(0, np.int64), (), np.zeros(0, bool), np.zeros(0),
-        np.zeros((0, _SAMPLES)), np.zeros(0), (), None,
+        np.zeros((0, _SAMPLES)), np.zeros(0), np.zeros(0), (), None,
     )  # fmt: skip
     if rings is None or not rings.features:
         return nothing
@@ -265,52 +269,66 @@ def _all_edges(state: State, rings: RingSystem, reach: tuple[int, int], sigma_px
     feature = np.array([k for k, _ in pairs])[order]
     outer = np.array([pairs[n][1] for n in order])
     sigma = np.array([rings.features[k].sigma_a_km or 0.0 for k in feature])
-    contrasts = _contrasts(rings)[order]
+    contrasts, unevenness = (values[order] for values in _contrasts(rings))
     names = tuple(rings.features[k].name for k in feature)
     return RingScene(
-        state, rings, reach, sigma_px, feature, names, outer, sigma, curves[order], contrasts, (),
+        state, rings, reach, sigma_px, feature, names, outer, sigma, curves[order], contrasts, unevenness, (),
         ray_grid(state.camera_model, canvas),
     )  # fmt: skip
 
 
-def _contrasts(rings: RingSystem) -> FloatArray:
-    """(n,) light outside less inside of every edge, in the order of features; the densest words win.
+def _contrasts(rings: RingSystem) -> tuple[FloatArray, FloatArray]:
+    """(n,) light outside less inside of every edge, in the order of features, and what texture does to it.
 
     What surrounds a gap is the narrowest ring around it, else the usual ring; what surrounds a ringlet the same, else
-    nothing. An edge alone has its ring on one side and, likewise, what surrounds it on the other.
+    nothing. An edge alone has its ring on one side and, likewise, what surrounds it on the other. A ring begins at an
+    inner edge, and ends at the next single edge.
     """
     observer = rings.observer_km
     mu = abs(float(observer[2])) / float(np.linalg.norm(observer))
     mu0 = max(abs(float(np.sin(rings.opening_sun_rad))), 1e-3)
     lit = np.sign(observer[2]) == np.sign(rings.opening_sun_rad) or rings.opening_sun_rad == 0.0
-    result = []
+    result: list[float] = []
+    uneven: list[float] = []
     for feature in rings.features:
         gap = feature.kind is RingKind.GAP
-        around = _around(rings, feature.a_km, feature.width_km, _USUAL_TAU if gap else 0.0)
+        around = _around(rings, feature, _USUAL_TAU if gap else 0.0)
         own = feature.tau if feature.tau is not None else (0.0 if gap else max(_USUAL_TAU, 2.0 * around))
-        light = single_scattering(np.array([own, around]), mu, mu0, bool(lit))
+        tau = np.array([own, around])
+        light = single_scattering(tau, mu, mu0, bool(lit))
+        denser = single_scattering(tau * (1.0 + _SMALL_CHANGE), mu, mu0, bool(lit))
         step = float(light[0] - light[1])
         if abs(step) < 1e-6:
             step = -1e-3 if gap else 1e-3
-        result += {
-            RingKind.RINGLET: [step, -step], RingKind.GAP: [step, -step], RingKind.EDGE_INNER: [step],
-            RingKind.EDGE_OUTER: [-step],
-        }[feature.kind]  # fmt: skip
+        signs = {RingKind.EDGE_INNER: (1.0,), RingKind.EDGE_OUTER: (-1.0,)}.get(feature.kind, (1.0, -1.0))
+        result += [sign * step for sign in signs]
+        uneven += [float(np.abs(denser - light).max()) / _SMALL_CHANGE / abs(step)] * len(signs)
     values = np.array(result)
-    return np.asarray(values / np.abs(values).max())
+    return np.asarray(values / np.abs(values).max()), np.array(uneven)
 
 
-def _around(rings: RingSystem, a_km: float, width_km: float, default: float) -> float:
-    """Optical depth of the narrowest ringlet that holds a range of radii."""
+def _around(rings: RingSystem, feature: RingFeature, default: float) -> float:
+    """Optical depth around a feature: of the narrowest ringlet that holds it, else of the ring that it lies in."""
+    low, high = feature.a_km, feature.a_km + feature.width_km
     holders = [
         f for f in rings.features
-        if f.kind is RingKind.RINGLET and f.width_km > width_km
-        and f.a_km <= a_km and a_km + width_km <= f.a_km + f.width_km
+        if f.kind is RingKind.RINGLET and f.width_km > feature.width_km
+        and f.a_km <= low and high <= f.a_km + f.width_km
     ]  # fmt: skip
-    if not holders:
+    if holders:
+        tau = min(holders, key=lambda f: f.width_km).tau
+        return default if tau is None else tau
+    alone = [f for f in rings.features if f is not feature and f.kind in (RingKind.EDGE_INNER, RingKind.EDGE_OUTER)]
+    before = max((f for f in alone if f.a_km <= low), key=lambda f: f.a_km, default=None)
+    after = min((f for f in alone if f.a_km >= high), key=lambda f: f.a_km, default=None)
+    ring = None
+    if before is not None and before.kind is RingKind.EDGE_INNER and feature.kind is not RingKind.EDGE_OUTER:
+        ring = before
+    elif after is not None and after.kind is RingKind.EDGE_OUTER and feature.kind is not RingKind.EDGE_INNER:
+        ring = after
+    if ring is None:
         return default
-    tau = min(holders, key=lambda f: f.width_km).tau
-    return default if tau is None else tau
+    return _USUAL_TAU if ring.tau is None else ring.tau
 
 
 def _with_bodies(scene: RingScene) -> RingScene:
@@ -363,7 +381,7 @@ def _culled(scene: RingScene, options: RingPredictionOptions) -> RingScene:
     return replace(
         scene, feature=scene.feature[keep], names=tuple(n for n, kept in zip(scene.names, keep, strict=True) if kept),
         outer=scene.outer[keep], sigma_km=scene.sigma_km[keep], curves=np.ascontiguousarray(scene.curves[keep]),
-        contrasts=scene.contrasts[keep], fates=fates,
+        contrasts=scene.contrasts[keep], unevenness=scene.unevenness[keep], fates=fates,
     )  # fmt: skip
 
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from pydantic import Field
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
 from pipeline.options import Options
 from pipeline.records import FloatArray, Record
@@ -173,7 +173,14 @@ def _albedo(segments: Segments) -> FloatArray:
     """Covariance of the shifts that unknown albedo makes."""
     gap = segments.place_vu[:, None, :] - segments.place_vu[None, :, :]
     distance = np.hypot(gap[..., 0], gap[..., 1])
-    return np.asarray(np.interp(distance, segments.texture_lags_px, segments.texture_px2))
+    covariance = np.asarray(np.interp(distance, segments.texture_lags_px, segments.texture_px2))
+    try:
+        cho_factor(covariance + np.diag(segments.sigma_px**2), lower=True)
+    except LinAlgError:
+        # A measured function of the distance along lines need not be a covariance in the plane: its nearest one.
+        values, vectors = np.linalg.eigh(covariance)
+        return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
+    return covariance
 
 
 def _common(segments: Segments, common: dict[int, float]) -> FloatArray:

@@ -25,7 +25,6 @@ from pipeline.techniques.ring_solve import (
     Levers,
     Radii,
     calibrated,
-    edge_scatter,
     first_radii,
     layout_of,
     levers_of,
@@ -40,6 +39,7 @@ from pipeline.techniques.ring_solve import (
     unit_weights,
     without_outlier,
 )
+from pipeline.techniques.ring_texture import change_along, edge_scatter, loosened
 from pipeline.techniques.ring_units import RingUnits, make_units
 
 _ROUNDS, _INNER = 6, 2
@@ -296,7 +296,8 @@ def _linearised(job: _Job, now: _Round, units: RingUnits, pixels: _Pixels, turn:
             return "no edge has enough pixels"
         if turn >= _DOUBT_FROM:
             weight = unit_weights(equations)
-        step = step_of(system_of(equations, weight, levers, layout, values), layout, now.radii, first)
+        loose = loosened(equations, units, layout, now.radii)
+        step = step_of(system_of(loose, weight, levers, layout, values), layout, now.radii, first)
         if not np.isfinite(step).all():
             return "the fit is degenerate"
         step *= min(1.0, _FARTHEST_STEP_PX / max(float(np.hypot(*step[:2])), _TINY))
@@ -340,9 +341,11 @@ def _concluded(
     freedom = float((weight * rank).sum())
     excess = max(1.0, float((weight * chi2).sum()) / max(freedom - min(float(size), freedom / 2), 1.0))
     calm = scaled(equations, excess)
-    system = system_of(calm, weight, levers, layout, values)
-    radii = replace(radii, values=values[layout.radii])
-    radii = edge_scatter(system, layout, without_outlier(system, layout, radii, _largest_scale(levers, layout)))
+    radii = change_along(calm, units, layout, replace(radii, values=values[layout.radii]))
+    system = system_of(loosened(calm, units, layout, radii), weight, levers, layout, values)
+    scale = _scales(levers, layout)
+    radii, texture = edge_scatter(system, layout, radii)
+    radii = without_outlier(system, layout, radii, scale[0], texture)
     prior = prior_of(layout, radii, False)
     total = system.gram + np.diag(prior)
     bound = np.concatenate([1.0 / layout.bounds**2, np.zeros(len(total) - size)])
@@ -353,21 +356,24 @@ def _concluded(
     radius, sigma, excluded = np.zeros(known), np.zeros(known), np.zeros(known, bool)
     radius[layout.used], sigma[layout.used] = radii.values[:features], radius_sigma[:features]
     excluded[layout.used] = radii.free[:features]
+    edge_km = np.where(scale[1] > 0, radii.values[features:] / np.maximum(scale[1], _TINY), 0.0)
     some = equations.freedom > 0
     figure = float(np.median(equations.fit[some, 0] / equations.freedom[some])) if some.any() else np.nan
     fit = RingFit(
-        np.zeros(2), 0.0, pivot, marginal(total, size), radius, sigma, radii.values[features:], excluded, units, shift,
+        np.zeros(2), 0.0, pivot, marginal(total, size), radius, sigma, edge_km, excluded, units, shift,
         shift_sigma, weight, equations.fit[:, 3:], excess, figure, int(equations.fit[:, 1].sum()),
         float(values[size]), float((equations.fit[:, 2] * (weight > 0)).sum()),
     )  # fmt: skip
     return fit, radii
 
 
-def _largest_scale(levers: Levers, layout: Layout) -> FloatArray:
-    """(features + edges,) largest shift per kilometre."""
-    edge = np.minimum(levers.edges[:, :1] + np.arange(MOST_EDGES), len(layout.column) - 1)
-    own = np.zeros(len(layout.column))
-    np.maximum.at(own, edge, levers.scale)
-    feature = np.zeros(layout.features)
-    np.maximum.at(feature, layout.column, own)
-    return np.concatenate([feature, own])
+def _scales(levers: Levers, layout: Layout) -> tuple[FloatArray, FloatArray]:
+    """(features,) largest shift per kilometre, and (edges,) the mean one; zero where none is in the image."""
+    present = levers.scale > 0
+    edge = (levers.edges[:, :1] + np.arange(MOST_EDGES))[present]
+    count = len(layout.column)
+    sums: FloatArray = np.bincount(edge, weights=levers.scale[present], minlength=count).astype(float)
+    mean = np.asarray(sums / np.maximum(np.bincount(edge, minlength=count), 1))
+    largest = np.zeros(layout.features)
+    np.maximum.at(largest, layout.column[edge], levers.scale[present])
+    return largest, mean

@@ -19,8 +19,11 @@ PIXEL_VARIANCE = 1.0 / 12.0
 _WIDTH_SHARE = 0.3
 # A feature is left out from so many sigmas on, if also by so many pixels, and if enough others agree.
 _OUTLIER_SIGMAS, _LEAST_OTHERS, _LEAST_TROUBLE_PX = 4.0, 2, 0.25
-# Sigma of single edges: at the start, while features are judged, and scale of its prior.
-_LOOSE_PX, _TIGHT_PX, _USUAL_EDGE_PX = 0.3, 0.02, 0.003
+# Wrong wings, widths and geometry move also edges of rings whose light does not depend on the optical depth; and a
+# predicted contrast of nearly nothing is not to be believed.
+_LEAST_UNEVEN, _MOST_UNEVEN = 0.15, 10.0
+# Sigma of single edges at the start.
+_LOOSE_PX = 0.3
 # A perfect catalogue is one whose errors no pixel shows; a free radius has this share of its prior's weight.
 _PERFECT_PX, _FREE = 1e-4, 1e-12
 # Standard deviation over median absolute value of a normal variable.
@@ -30,7 +33,7 @@ _TINY = 1e-12
 
 @dataclass(frozen=True, eq=False)
 class Layout:
-    """Order of the parameters: (dv, du[, theta], blur variance, features' radii, edges' radii).
+    """Order of the parameters: (dv, du[, theta], blur variance, features' radii in km, edges' shifts in px).
 
     Attributes
     ----------
@@ -44,6 +47,8 @@ class Layout:
         Variance of the blur, px^2.
     km_per_px
         At the planet's distance.
+    texture_px
+        (edges,) shift of each edge per relative unevenness of its rings, see :mod:`pipeline.techniques.ring_texture`.
     bounds
         (size,) margin in pixels and largest rotation, which keep a step short where edges do not show it.
     """
@@ -53,6 +58,7 @@ class Layout:
     column: NDArray[np.int64]
     blur2: float
     km_per_px: float
+    texture_px: FloatArray
     bounds: FloatArray
 
     @property
@@ -67,7 +73,7 @@ class Layout:
 
     @property
     def radii(self) -> slice:
-        """Where the radii are."""
+        """Where the errors of features and edges are."""
         return slice(self.size + 1, None)
 
 
@@ -91,31 +97,61 @@ def layout_of(scene: RingScene, context: NavContext) -> Layout:
     scale = camera.focal_length_mm * np.sqrt(abs(np.linalg.det(camera.k_px_per_mm)))
     used = np.unique(scene.feature)
     bounds = [*context.search_margin_vu, *([context.max_rotation_rad] if context.fit_camera_rotation else [])]
+    blur2 = scene.sigma_px**2 + PIXEL_VARIANCE
     return Layout(
-        len(bounds), used, np.searchsorted(used, scene.feature).astype(np.int64), scene.sigma_px**2 + PIXEL_VARIANCE,
-        float(np.linalg.norm(rings.position_km) / scale), np.array(bounds),
+        len(bounds), used, np.searchsorted(used, scene.feature).astype(np.int64), blur2,
+        float(np.linalg.norm(rings.position_km) / scale), texture_shift(scene.unevenness, blur2), np.array(bounds),
     )  # fmt: skip
+
+
+def texture_shift(unevenness: FloatArray, blur2: float) -> FloatArray:
+    """Shift of edges per relative unevenness of the optical depth beside them.
+
+    Light that is off by a share of the contrast over the width of the blur moves a blurred step by that share of it.
+
+    Parameters
+    ----------
+    unevenness
+        (n,) of :class:`pipeline.predict.rings.RingScene`.
+    blur2
+        Variance of the blur, px^2.
+
+    Returns
+    -------
+    numpy.ndarray
+        (n,) pixels.
+    """
+    return np.asarray(np.sqrt(blur2) * np.hypot(np.minimum(unevenness, _MOST_UNEVEN), _LEAST_UNEVEN))
 
 
 @dataclass(frozen=True, eq=False)
 class Radii:
-    """Unknown radius errors in km: of the scene's features, then of its edges alone.
+    """Unknown errors: radii of the scene's features in km, then shifts of its edges alone in pixels.
 
-    An edge alone is off where its blur, or light beside it, is not what a step has; its sigma is what all edges of the
-    image show, see :func:`edge_scatter`.
+    An edge alone is off where its blur, or light beside it, is not what a step has.
+
+    Attributes
+    ----------
+    values, sigma
+        (features + edges,) and what is believed of them.
+    free
+        (features + edges,) True where nothing is.
+    along
+        Variance over so many pixels along an edge, as a share of the edges' own.
     """
 
     values: FloatArray
     sigma: FloatArray
     free: BoolArray
+    along: float
 
 
 def first_radii(scene: RingScene, layout: Layout) -> Radii:
     """No errors yet, catalogue's sigmas."""
     first = np.unique(scene.feature, return_index=True)[1]
     known = np.maximum(scene.sigma_km[first], _PERFECT_PX * layout.km_per_px)
-    sigma = np.concatenate([known, np.full(len(scene), _LOOSE_PX * layout.km_per_px)])
-    return Radii(np.zeros(len(sigma)), sigma, np.zeros(len(sigma), bool))
+    sigma = np.concatenate([known, np.full(len(scene), _LOOSE_PX)])
+    return Radii(np.zeros(len(sigma)), sigma, np.zeros(len(sigma), bool), 0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,8 +200,9 @@ def shifts_of(levers: Levers, layout: Layout, values: FloatArray) -> FloatArray:
     if layout.size == 3:
         shifts += levers.lever * values[2]
     edge = np.minimum(levers.edges[:, :1] + np.arange(MOST_EDGES), len(layout.column) - 1)
-    radii = values[layout.radii]
-    return np.asarray(shifts + levers.scale * (radii[layout.column[edge]] + radii[layout.features + edge]))
+    errors = values[layout.radii]
+    own = errors[layout.features + edge] * (levers.scale > 0)
+    return np.asarray(shifts + levers.scale * errors[layout.column[edge]] + own)
 
 
 @dataclass(frozen=True, eq=False)
@@ -311,7 +348,7 @@ def marginal(total: FloatArray, size: int) -> FloatArray:
     return np.asarray((result + result.T) / 2)
 
 
-def without_outlier(system: System, layout: Layout, radii: Radii, px_per_km: FloatArray) -> Radii:
+def without_outlier(system: System, layout: Layout, radii: Radii, px_per_km: FloatArray, texture: float) -> Radii:
     """Free the radius of the feature that contradicts all others, if one does by far.
 
     Parameters
@@ -321,7 +358,9 @@ def without_outlier(system: System, layout: Layout, radii: Radii, px_per_km: Flo
     layout, radii
         Parameters and their priors.
     px_per_km
-        (features + edges,) largest shift of each per kilometre, zero where it is not in the image.
+        (features,) largest shift of each per kilometre, zero where it is not in the image.
+    texture
+        Relative unevenness of the rings.
 
     Returns
     -------
@@ -331,12 +370,10 @@ def without_outlier(system: System, layout: Layout, radii: Radii, px_per_km: Flo
     count = layout.features
     if count <= _LEAST_OTHERS:
         return radii
-    tight = radii.sigma.copy()
-    seen = px_per_km[count:] > 0
-    tight[count:][seen] = _TIGHT_PX / px_per_km[count:][seen]
-    prior = prior_of(layout, replace(radii, sigma=tight), False)
+    sigma_all = np.concatenate([radii.sigma[:count], texture * layout.texture_px])
+    prior = prior_of(layout, replace(radii, sigma=sigma_all), False)
     prior[: layout.size] = 1.0 / layout.bounds**2
-    inverse = _inverse(system.gram + np.diag(prior))
+    inverse = inverse_of(system.gram + np.diag(prior))
     at = layout.size + 1 + np.arange(count)
     pull = system.pull - prior * system.values
     pull[: layout.size] = system.pull[: layout.size]
@@ -360,54 +397,10 @@ def without_outlier(system: System, layout: Layout, radii: Radii, px_per_km: Flo
     return replace(radii, free=free)
 
 
-def _inverse(matrix: FloatArray) -> FloatArray:
-    """Inverse of a badly scaled positive matrix."""
+def inverse_of(matrix: FloatArray) -> FloatArray:
+    """Inverse of a badly scaled positive (n, n) matrix."""
     scale = 1.0 / np.sqrt(np.maximum(np.diag(matrix), 1e-300))
     return np.asarray(np.linalg.inv(matrix * np.outer(scale, scale)) * np.outer(scale, scale))
-
-
-def edge_scatter(system: System, layout: Layout, radii: Radii) -> Radii:
-    """Sigma of single edges: the most likely one, all other parameters being free (restricted maximum likelihood).
-
-    With the edges' own errors w of sigma s, information A and pull b on them, the likelihood is
-    ``det(I + s^2 A)^(-1/2) exp(b (A + I / s^2)^-1 b / 2)`` (Patterson and Thompson 1971, Biometrika 58, 545); a Cauchy
-    prior keeps s small where an image has too few edges to tell.
-
-    Parameters
-    ----------
-    system
-        Without priors.
-    layout, radii
-        Parameters and their priors.
-
-    Returns
-    -------
-    Radii
-        With the edges' sigma renewed.
-    """
-    first = layout.size + 1 + layout.features
-    prior = prior_of(layout, radii, False)
-    prior[: layout.size] = 1.0 / layout.bounds**2
-    # About errors of zero, not about the present ones, whose prior is left out.
-    prior[first:] = 0.0
-    own = system.values.copy()
-    own[:first] = 0.0
-    target = prior * system.values
-    target[: layout.size] = 0.0
-    pull = system.pull - target + system.gram @ own
-    gram = system.gram + np.diag(prior + _TINY * np.diag(system.gram) + 1e-300)
-    inner = _inverse(gram[:first, :first])
-    cross = gram[first:, :first]
-    block = (gram[first:, first:] - cross @ inner @ cross.T) * layout.km_per_px**2
-    told = (pull[first:] - cross @ (inner @ pull[:first])) * layout.km_per_px
-    strength, vectors = np.linalg.eigh((block + block.T) / 2)
-    strength, along = np.maximum(strength, 0.0), vectors.T @ told
-    grid = np.geomspace(1e-3, 3.0, 60)[:, None]
-    likely = (-0.5 * np.log1p(grid**2 * strength) + 0.5 * along**2 / (strength + 1.0 / grid**2)).sum(axis=1)
-    likely -= np.log1p((grid[:, 0] / _USUAL_EDGE_PX) ** 2)
-    sigma = radii.sigma.copy()
-    sigma[layout.features :] = float(grid[int(np.argmax(likely)), 0]) * layout.km_per_px
-    return replace(radii, sigma=sigma)
 
 
 def own_shifts(equations: Equations, units: RingUnits) -> tuple[FloatArray, FloatArray]:

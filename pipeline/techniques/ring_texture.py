@@ -1,0 +1,133 @@
+"""How far texture shifts ring edges: one error per edge, and what changes along it, as likely as an image shows.
+
+Rings are uneven: undulations, waves and wakes beside an edge, which no catalogue has, shift its blurred step by a share
+of the blur. What depends on the radius alone shifts an edge all along, and no number of pixels averages it away; what
+changes along the edge has the spectral power at long waves that independent errors of its pieces would need to have.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from pipeline.imaging.ring_light import MOST_EDGES
+from pipeline.techniques.ring_solve import Equations, Layout, Radii, System, inverse_of, own_shifts, prior_of
+from pipeline.techniques.ring_units import RingUnits
+
+# Relative unevenness of rings over the width of a blur: scale and width (natural logarithm) of the prior, and its grid.
+# Saturn's A and B rings scatter by a tenth and more from pixel to pixel in images that resolve them.
+USUAL_TEXTURE, _TEXTURE_WIDTH = 0.1, 0.7
+_TEXTURES = np.geomspace(1e-3, 3.0, 60)
+# Share of an edge's own sigma by which neighbouring stretches of so many pieces differ, and stretches that say as much.
+_ALONG_SHARE, _STRETCH, _ALONG_PRIOR = 0.2, 8, 8.0
+_LEAST_ALONG, _MOST_ALONG = 0.1, 100.0
+
+
+def edge_scatter(system: System, layout: Layout, radii: Radii) -> tuple[Radii, float]:
+    """Sigma of single edges: the most likely one, all other parameters being free (restricted maximum likelihood).
+
+    With the edges' own errors w of sigma s, information A and pull b on them, the likelihood is
+    ``det(I + s^2 A)^(-1/2) exp(b (A + I / s^2)^-1 b / 2)`` (Patterson and Thompson 1971, Biometrika 58, 545); all edges
+    share one unevenness, whose prior has the tails of Student's distribution.
+
+    Parameters
+    ----------
+    system
+        Without priors.
+    layout, radii
+        Parameters and their priors.
+
+    Returns
+    -------
+    tuple
+        Radii with the edges' sigma renewed; the unevenness.
+    """
+    first = layout.size + 1 + layout.features
+    prior = prior_of(layout, radii, False)
+    prior[: layout.size] = 1.0 / layout.bounds**2
+    # About errors of zero, not about the present ones, whose prior is left out.
+    prior[first:] = 0.0
+    own = system.values.copy()
+    own[:first] = 0.0
+    target = prior * system.values
+    target[: layout.size] = 0.0
+    pull = system.pull - target + system.gram @ own
+    gram = system.gram + np.diag(prior + 1e-12 * np.diag(system.gram) + 1e-300)
+    inner = inverse_of(gram[:first, :first])
+    cross = gram[first:, :first]
+    scale = layout.texture_px
+    block = (gram[first:, first:] - cross @ inner @ cross.T) * np.outer(scale, scale)
+    told = (pull[first:] - cross @ (inner @ pull[:first])) * scale
+    strength, vectors = np.linalg.eigh((block + block.T) / 2)
+    strength, along = np.maximum(strength, 0.0), vectors.T @ told
+    grid = _TEXTURES[:, None]
+    likely = (-0.5 * np.log1p(grid**2 * strength) + 0.5 * along**2 / (strength + 1.0 / grid**2)).sum(axis=1)
+    likely -= 2.5 * np.log1p((np.log(_TEXTURES / USUAL_TEXTURE) / _TEXTURE_WIDTH) ** 2 / 4.0)
+    texture = float(_TEXTURES[int(np.argmax(likely))])
+    sigma = radii.sigma.copy()
+    sigma[layout.features :] = texture * scale
+    return replace(radii, sigma=sigma), texture
+
+
+def loosened(equations: Equations, units: RingUnits, layout: Layout, radii: Radii) -> Equations:
+    """Equations of units whose edges' shifts err one by one: G becomes (1 + G S)^-1 G with S the errors' variances.
+
+    Parameters
+    ----------
+    equations, units
+        Without such errors.
+    layout, radii
+        Sigma of the edges, of which these errors are a share.
+
+    Returns
+    -------
+    Equations
+        Of the same units.
+    """
+    edge = np.minimum(units.edges[:, :1] + np.arange(MOST_EDGES), len(layout.column) - 1)
+    variance = np.zeros(equations.pull.shape)
+    variance[:, :MOST_EDGES] = radii.along * radii.sigma[layout.features + edge] ** 2 * units.present
+    matrix = np.eye(MOST_EDGES + 1) + equations.gram * variance[:, None, :]
+    both = np.concatenate([equations.gram, equations.pull[:, :, None]], axis=2)
+    solved = np.linalg.solve(matrix, both)
+    return replace(equations, gram=solved[:, :, :-1], pull=solved[:, :, -1])
+
+
+def change_along(equations: Equations, units: RingUnits, layout: Layout, radii: Radii) -> Radii:
+    """How much edges' shifts change along them, by the scatter of stretches of pieces about their edge's mean.
+
+    Parameters
+    ----------
+    equations, units
+        Without errors of pieces, at the end of a round.
+    layout, radii
+        Sigma of the edges.
+
+    Returns
+    -------
+    Radii
+        With ``along`` renewed.
+    """
+    shift, sigma = own_shifts(equations, units)
+    row, column = np.nonzero(np.isfinite(shift) & (equations.freedom > 0)[:, None])
+    edge = units.edges[row, 0] + column
+    order = np.lexsort((units.longitude_rad[row], edge))
+    row, column, edge = row[order], column[order], edge[order]
+    excess, weights = _ALONG_PRIOR, _ALONG_PRIOR
+    for k in np.unique(edge):
+        mine = edge == k
+        count = int(mine.sum())
+        usual = (_ALONG_SHARE * radii.sigma[layout.features + k]) ** 2
+        if count < 2 * _STRETCH or usual <= 0.0:
+            continue
+        stretch = np.minimum(np.arange(count) // _STRETCH, count // _STRETCH - 1)
+        w = 1.0 / sigma[row[mine], column[mine]] ** 2
+        precision = np.bincount(stretch, weights=w)
+        mean = np.bincount(stretch, weights=w * shift[row[mine], column[mine]]) / precision
+        noise = 1.0 / precision
+        trust = (usual / (noise + usual)) ** 2
+        gap = mean - float((precision * mean).sum() / precision.sum())
+        freed = np.maximum(1.0 - precision / precision.sum(), 1e-3)
+        excess += float((trust * (gap**2 / freed - noise)).sum() / usual)
+        weights += float(trust.sum())
+    factor = float(np.clip(excess / weights, _LEAST_ALONG, _MOST_ALONG))
+    return replace(radii, along=factor * _ALONG_SHARE**2 * _STRETCH)
