@@ -21,11 +21,13 @@ _HEAD = """# Outputs
 | `images/<id>.json` | per image: answer, covariance, corrected pointing, every technique's features, provenance |
 | `offsets/`, `techniques/`, `features/`, `timings/` | Parquet datasets, partitioned by mission and camera |
 | `state/<id>.json` | what an image was made from (sizes, times, sha256) and its timings: marks for resuming |
-| `plan.json`, `run.json` | images of the latest run; versions, configuration, catalogues, counts, start and end |
+| `plan.json`, `run.json` | images of the latest run; archive, versions, configuration, catalogues, counts, times |
+| `log.jsonl` | the log of all starts, one JSON object per line |
 
 Every file is written under a temporary name and renamed. Two runs on the same input compare equal byte for byte,
-whatever the number of workers, but for `timings`, `state` and `run.json`, which hold clocks. Pixels are (v, u), rows
-first, the centre of the first pixel at (0, 0); null means not known or not observable, never a sentinel.
+whatever the number of workers, but for `timings`, `state`, `run.json` and the log, which hold clocks. A table has one
+Parquet file per mission and camera, written anew by each run, so there are no small files to compact. Pixels are
+(v, u), rows first, the centre of the first pixel at (0, 0); null means not known or not observable, never a sentinel.
 
 """
 
@@ -41,13 +43,98 @@ _TABLES = {
 }
 
 
+_NO_ANSWER = "no answer"
+_NO_FULL = "no answer, or only one direction of it is observable"
+_NOT_FITTED = "the rotation was not fitted, or is not observable"
+_NO_LABEL = "the label does not say"
+_NOT_FOUND = "not found in the image"
+_REFUSED = "the technique gave no answer: see status_reason"
+_NO_RAW = "the image alone has no pose"
+# By table: columns that may be null, and what a null means. No other column ever is.
+_NULLS: dict[str, dict[tuple[str, ...], str]] = {
+    "offsets": {
+        ("time_utc",): "neither geometry nor label says when",
+        ("product_id", "target", "filter", "exposure_s"): _NO_LABEL,
+        ("confidence",): _NO_ANSWER,
+        ("offset_dv_px", "offset_du_px", "sigma_dv_px", "sigma_du_px", "cov_dv_du_px2"): _NO_FULL,
+        ("rotation_deg", "sigma_rotation_deg"): _NOT_FITTED,
+        ("observable_dv", "observable_du", "offset_along_px", "sigma_along_px"): "both directions, or none, are known",
+        ("qw", "qx", "qy", "qz"): _NO_FULL,
+        ("features_used",): "no technique was fused",
+        ("image_class",): "the image was refused before it was looked at",
+        ("rows", "columns"): "no camera model, or written by an older version",
+    },
+    "techniques": {
+        ("offset_dv_px", "offset_du_px", "sigma_dv_px", "sigma_du_px", "cov_dv_du_px2", "confidence", "at_edge",
+         "pivot_v_px", "pivot_u_px", "in_ensemble"): _REFUSED,
+        ("rotation_deg", "sigma_rotation_deg"): _NOT_FITTED,
+        ("left_out",): "fused, or without an answer",
+        ("features_used",): "the technique keeps no list of features",
+        ("extra_sigma_px",): "the technique does not estimate it",
+        ("detail",): "nothing to say",
+    },
+    "features": {
+        ("predicted_v_px", "predicted_u_px"): "a body that has no single place, such as a limb",
+        ("measured_v_px", "measured_u_px", "residual_v_px", "residual_u_px", "sigma_px"): _NOT_FOUND,
+        ("mag",): "no star",
+        ("snr",): "not a star, nor a piece of a limb or terminator",
+    },
+    "ring_edges": {
+        ("longitude_deg", "radius_km", "sigma_km"): "the line of sight misses the ring plane",
+    },
+    "landmarks": {
+        ("predicted_v_px", "predicted_u_px"): "outside the camera's field",
+        ("observed_v_px", "observed_u_px", "offset_dv_px", "offset_du_px", "sigma_dv_px", "sigma_du_px",
+         "cov_dv_du_px2", "correlation", "bin"): _NOT_FOUND,
+        ("incidence_deg", "emission_deg", "cells_per_pixel"): "removed before it was known",
+        ("cov_xx_km2", "cov_xy_km2", "cov_xz_km2", "cov_yy_km2", "cov_yz_km2", "cov_zz_km2"): (
+            "the catalogue does not say"
+        ),
+    },
+    "poses": {
+        ("mission", "camera"): "from a file of matches",
+        ("arc_id",): "arcs were not smoothed yet",
+        ("view_id",): "from a run's images",
+        ("covariance_mode", "method", "matches_used", "rms_px"): _NO_RAW,
+        ("failure",): "the image alone has a pose",
+        ("offset_used",): "no navigated offset",
+        ("last_satellite_anchor_age_ms",): "no anchored image before this one",
+        ("lat_deg", "lon_deg", "ellipsoidal_m", "datum"): "the body has no datum",
+        ("alt_m",): "no geoid",
+        ("raw_",): _NO_RAW,
+    },
+    "arcs": {("mission", "camera"): "from a file of matches"},
+    "timings": {("emitted_at_ns",): "no stage that emits a pose"},
+}  # fmt: skip
+
+
+def null_meaning(table: str, column: str) -> str:
+    """What a null in a column means.
+
+    Parameters
+    ----------
+    table, column
+        Names; a beginning that ends in ``_`` stands for all columns that share it.
+
+    Returns
+    -------
+    str
+        Empty where the column is never null.
+    """
+    for names, meaning in _NULLS[table].items():
+        if any(column == name or (name.endswith("_") and column.startswith(name)) for name in names):
+            return meaning
+    return ""
+
+
 def _describe(parts: list[str], name: str, text: str, schema: pa.Schema) -> None:
     """Append the section of one table."""
     parts.append(f"## {name}\n\n{text}\n\n")
-    parts.append("| column | type | unit | meaning |\n|---|---|---|---|\n")
+    parts.append("| column | type | unit | meaning | null means |\n|---|---|---|---|---|\n")
     for field in schema:
         said = {key.decode(): value.decode() for key, value in field.metadata.items()}
-        parts.append(f"| `{field.name}` | {field.type} | {said['unit']} | {said['meaning']} |\n")
+        cells = (f"`{field.name}`", str(field.type), said["unit"], said["meaning"], null_meaning(name, field.name))
+        parts.append(f"| {' | '.join(cells)} |\n")
     parts.append("\n")
 
 

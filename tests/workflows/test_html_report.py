@@ -149,7 +149,7 @@ def _contrast(ink: list[float], paper: list[float]) -> float:
 def test_a_hundred_thousand_images_open_quickly_and_whole(hundred_thousand: Path, page: Page) -> None:
     report = _report(hundred_thousand)
     assert report.stat().st_size < LARGEST_MB * 1e6
-    seconds = []
+    seconds: list[float] = []
     while len(seconds) < TRIES and min(seconds, default=OPENS_WITHIN_S) >= OPENS_WITHIN_S:
         started = time.perf_counter()
         assert _open(page, report) == []
