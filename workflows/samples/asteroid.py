@@ -21,7 +21,7 @@ from workflows.samples.asteroid_options import BODY, AsteroidOptions
 from workflows.samples.asteroid_plan import AsteroidShot, plan_frame
 from workflows.samples.asteroid_rays import Ground, ground_of
 from workflows.samples.asteroid_render import expose
-from workflows.samples.asteroid_surface import Asteroid, directions_of_face, make_asteroid, value_at
+from workflows.samples.asteroid_surface import Asteroid, directions_of_face, make_asteroid, values_at
 from workflows.samples.asteroid_truth import CONVENTION, truth_entry
 from workflows.samples.cameras import FloatArray
 from workflows.samples.flyby_cameras import flyby_cameras
@@ -84,8 +84,8 @@ def write_coarse_shape(path: Path, coarse: Asteroid) -> None:
 def _shape_sigma_km(coarse: Asteroid, ground: Ground) -> float:
     """Return the rms height of the fine surface over the coarse one."""
     ways = np.random.default_rng(5).standard_normal((SHAPE_PROBES, 3))
-    gaps = [value_at(ground.radius_km, *way) - value_at(coarse.radius_km, *way) for way in ways]
-    return float(np.sqrt(np.mean(np.square(gaps))))
+    gaps = values_at(ground.radius_km, ways) - values_at(coarse.radius_km, ways)
+    return float(np.sqrt(np.mean(gaps**2)))
 
 
 def _margin_px(options: AsteroidOptions) -> float:

@@ -15,7 +15,7 @@ from scipy.ndimage import gaussian_filter
 from workflows.samples.asteroid_options import AsteroidOptions
 from workflows.samples.asteroid_plan import AsteroidShot, eye_of, pixels_of
 from workflows.samples.asteroid_rays import Ground, hits
-from workflows.samples.asteroid_surface import value_at
+from workflows.samples.asteroid_surface import value_at, values_at
 from workflows.samples.cameras import FloatArray
 
 RECORD_BYTES = 72
@@ -65,10 +65,6 @@ def spread(count: int) -> FloatArray:
     return np.stack([across * np.cos(GOLDEN * k), across * np.sin(GOLDEN * k), z], axis=1)
 
 
-def _radii(ground: Ground, ways: FloatArray) -> FloatArray:
-    return np.array([value_at(ground.radius_km, *way) for way in ways])
-
-
 def _axes(normal: FloatArray) -> FloatArray:
     """Return the rows of a frame whose z is a unit normal and whose y points east, or along the equator at a pole."""
     pole = np.array([0.0, 0.0, 1.0]) if abs(normal[2]) < 0.999 else np.array([1.0, 0.0, 0.0])
@@ -86,7 +82,7 @@ def _mean_normal(ground: Ground, way: FloatArray, side_km: float) -> FloatArray:
     a, b = (part.ravel() for part in np.meshgrid(steps, steps, indexing="ij"))
     ways = radius * z + a[:, None] * x + b[:, None] * y
     ways /= np.linalg.norm(ways, axis=1)[:, None]
-    places = ways * _radii(ground, ways)[:, None]
+    places = ways * values_at(ground.radius_km, ways)[:, None]
     places -= places.mean(axis=0)
     normal = np.linalg.svd(places, full_matrices=False)[2][2]
     outward: FloatArray = normal if normal @ way > 0.0 else -normal
@@ -107,7 +103,7 @@ def _cut(
     met = starts + down[:, None] * rays
     known = np.isfinite(down)
     light = np.full(len(down), np.nan)
-    light[known] = [value_at(ground.albedo, *point) for point in met[known]]
+    light[known] = values_at(ground.albedo, met[known])
     n = 2 * half + 1
     fields = [field.reshape(n, parts, n, parts).mean(axis=(1, 3)) for field in ((reach - down) / scale_km, light)]
     return fields[0], fields[1]
@@ -146,7 +142,7 @@ def wanted(
     area = 4.0 * np.pi * float(np.mean(ground.radius_km.astype(np.float64) ** 2))
     side = (2 * options.half + 1) * options.scales_km[series]
     ways = spread(max(1, round(options.coverage * area / side**2)))
-    places = ways * _radii(ground, ways)[:, None]
+    places = ways * values_at(ground.radius_km, ways)[:, None]
     seen = np.zeros(len(ways), np.bool_)
     for item in shots:
         optics, sighting = item.shot.camera.optics, item.sighting()

@@ -13,7 +13,7 @@ from workflows.samples.cameras import FloatArray
 MOST_STEPS = 4000
 TOLERANCE = 2e-6
 """Distance to the surface, over the largest radius, at which a ray has met it."""
-STEEPEST = 2.0
+STEEPEST = 1.6
 """The few cells, sides of boulders, that rise faster lose a sliver of their edges at worst."""
 SHADOW_STEP = 1.5e-4
 """Least step of a ray toward the Sun, and below half of it a dip under the surface counts as none; over the radius."""

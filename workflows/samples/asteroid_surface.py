@@ -178,6 +178,15 @@ def value_at(field, x, y, z):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True)
+def values_at(field, places):  # type: ignore[no-untyped-def]
+    """Values (n,) of a map in directions (n, 3)."""
+    values = np.empty(len(places))
+    for k in range(len(places)):
+        values[k] = value_at(field, places[k, 0], places[k, 1], places[k, 2])
+    return values
+
+
+@numba.njit(cache=True)
 def _steepest(radius):  # type: ignore[no-untyped-def]
     """Largest slope between neighbours of a map, rise over run."""
     n = radius.shape[1] - 1
