@@ -105,13 +105,13 @@ class Views:
     table: MatchTable
     throttled: frozenset[int] = frozenset()
 
-    def places(self, without: int | None = None) -> Intersections:
-        """Places of all points: those of the file, else from the given views but one."""
+    def places(self, without: int | None = None, robust: bool = True) -> Intersections:
+        """Places of all points: those of the file, else from the given views but one, wrong lines of sight left out."""
         if self.table.points_km is not None:
             return _given_places(self)
         poses = {view: pose for view, pose in self.given.items() if view != without}
         sigma = self.options.assumed_sigma_px
-        return triangulate_views(self.calibration.camera, self.sightings, poses, len(self.points), sigma)
+        return triangulate_views(self.calibration.camera, self.sightings, poses, len(self.points), sigma, robust)
 
 
 def _given_places(views: Views) -> Intersections:
@@ -163,11 +163,12 @@ def prepare(table: MatchTable, cameras: Cameras) -> Views:
         return plain
     if len(given) < 2:
         raise ConfigurationError("points have no places (x_km, y_km, z_km), and fewer than two views have poses")
-    away = looks_away(plain.places())
+    away = looks_away(plain.places(robust=False))
     given = {key: turned(pose) for key, pose in given.items()} if away else given
     options = PoseOptions()
     if table.pixel_covariance_px2 is None:
-        places = triangulate_views(calibration.camera, sightings, given, len(points), options.assumed_sigma_px)
+        first = options.assumed_sigma_px
+        places = triangulate_views(calibration.camera, sightings, given, len(points), first, robust=False)
         if places.ok.any():
             sigma = sigma_of(calibration.camera, sightings, given, places.places_km)
             options = PoseOptions(assumed_sigma_px=max(sigma, 1e-6))

@@ -17,7 +17,13 @@ from pipeline.pose.records import (
     PoseEstimate,
     ThermalState,
 )
-from pipeline.pose.triangulation import Intersections, LinesOfSight, TriangulationMethod, intersect_lines
+from pipeline.pose.triangulation import (
+    Intersections,
+    LinesOfSight,
+    TriangulationMethod,
+    agreeing_lines,
+    intersect_lines,
+)
 from pipeline.records import BoolArray, CameraModel, FloatArray, Record
 
 # Share of the places behind the cameras at which it is the positions that are written the other way round.
@@ -55,7 +61,7 @@ class Sightings(Record):
 
 
 def triangulate_views(
-    camera: CameraModel, sightings: Sightings, poses: dict[int, Pose], count: int, sigma_px: float
+    camera: CameraModel, sightings: Sightings, poses: dict[int, Pose], count: int, sigma_px: float, robust: bool = True
 ) -> Intersections:
     """Places of points from all views whose poses are known.
 
@@ -71,6 +77,8 @@ def triangulate_views(
         Points.
     sigma_px
         Where the sightings state none.
+    robust
+        Leave out lines of sight that the others of a point contradict; only where sigmas can be believed.
 
     Returns
     -------
@@ -88,6 +96,8 @@ def triangulate_views(
     turns = np.stack([poses[int(k)].camera_from_body for k in order])[row]
     centres = np.stack([poses[int(k)].position_km for k in order])[row]
     lines = LinesOfSight(point[good], plane.xy[good], plane.covariance[good], turns, centres)
+    if robust:
+        lines = lines.take(agreeing_lines(lines, count))
     return intersect_lines(lines, count, TriangulationMethod.LOST)
 
 

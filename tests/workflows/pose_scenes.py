@@ -144,7 +144,7 @@ def _landmarks(rng: np.random.Generator, true: Pose, points: np.ndarray) -> dict
     state: dict[str, Json] = {
         "body": "ROCK", "position_km": true.position_km.tolist(),
         "camera_from_body_wxyz": quaternion_from_matrix(true.camera_from_body).tolist(),
-        "covariance": [[float(i == j) for j in range(6)] for i in range(6)], "landmarks_used": count, "landmarks_rejected": 0,
-        "observable_directions": 6, "converged": True,
+        "covariance": [[float(i == j) for j in range(6)] for i in range(6)],
+        "landmarks_used": count, "landmarks_rejected": 0, "observable_directions": 6, "converged": True,
     }  # fmt: skip
     return {"landmarks": columns, "landmark_state": state}

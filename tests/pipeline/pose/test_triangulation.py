@@ -15,6 +15,7 @@ from pipeline.pose.triangulation import (
     TriangulationOptions,
     intersect_lines,
 )
+from pipeline.pose.views import Sightings, triangulate_views
 from tests.pipeline.pose.scenes import CAMERAS
 
 METHODS = tuple(TriangulationMethod)
@@ -134,3 +135,33 @@ def test_bad_input_is_one_error_each() -> None:
             _locate(p, x, pose, "linear")
     with pytest.raises(ValueError, match="greater than or equal"):
         TriangulationOptions(uncertaintyImageMeasurement=-1.0)
+
+
+def test_a_wrong_view_does_not_bend_a_point() -> None:
+    rng = np.random.default_rng(11)
+    places = rng.normal(size=(300, 3)) * 20.0
+    camera, poses = CAMERAS[2], []
+    for k in range(6):
+        centre = 400.0 * np.array([np.cos(0.15 * k), np.sin(0.15 * k), 0.1 * (k % 2)])
+        z = -centre / np.linalg.norm(centre)
+        x = np.cross([0.0, 0.0, 1.0], z) / np.linalg.norm(np.cross([0.0, 0.0, 1.0], z))
+        poses.append(Pose(np.stack([x, np.cross(z, x), z]), centre))
+    pixels = np.stack([project(camera, pose.to_camera(places))[0] for pose in poses], axis=1)
+    pixels += rng.normal(size=pixels.shape) * 0.5
+    wrong = rng.random((300, 6)) < 0.08
+    pixels[wrong] += rng.uniform(20, 200, (int(wrong.sum()), 2)) * rng.choice([-1.0, 1.0], (int(wrong.sum()), 2))
+    view, point = np.tile(np.arange(6), 300), np.repeat(np.arange(300), 6)
+    sightings = Sightings(view, point, pixels.reshape(-1, 2))
+    given = dict(enumerate(poses))
+    nees = {}
+    for robust in (True, False):
+        found = triangulate_views(camera, sightings, given, 300, 0.5, robust)
+        away = (found.places_km - places)[found.ok]
+        nees[robust] = np.einsum("ni,nij,nj->n", away, np.linalg.inv(found.covariance_km2[found.ok]), away)
+        assert found.ok.sum() > (295 if robust else 200)
+    assert 2.6 < nees[True].mean() < 3.5
+    assert np.percentile(nees[False], 90) > 1000.0
+    # Of a point that two views see nobody knows which is wrong: it stays as it is.
+    pair = triangulate_views(camera, sightings, {0: poses[0], 1: poses[1]}, 300, 0.5)
+    alone = triangulate_views(camera, sightings, {0: poses[0], 1: poses[1]}, 300, 0.5, robust=False)
+    assert np.array_equal(pair.places_km, alone.places_km, equal_nan=True)
