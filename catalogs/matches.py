@@ -16,6 +16,8 @@ from pipeline.pose.records import CameraCalibration, MatchError, Pose
 from pipeline.records import CameraModel, FloatArray, Record
 
 _REQUIRED = ("view_id", "point_id", "v_px", "u_px")
+# Beyond, a floating-point column cannot hold every whole number.
+_LARGEST_ID = 2**53
 _PIXEL_COVARIANCE = ("cov_vv", "cov_vu", "cov_uu")
 _PLACE = ("x_km", "y_km", "z_km")
 _POINT_COVARIANCE = ("cov_xx_km2", "cov_xy_km2", "cov_xz_km2", "cov_yy_km2", "cov_yz_km2", "cov_zz_km2")
@@ -193,7 +195,7 @@ def read_image_matches(data: bytes, name: str) -> MatchTable:
 
 def _integers(table: pd.DataFrame, column: str, name: str) -> NDArray[np.int64]:
     values = pd.to_numeric(table[column], errors="coerce")
-    whole = values.notna() & (values % 1 == 0)
+    whole = values.notna() & (values % 1 == 0) & (values.abs() < _LARGEST_ID)
     if not whole.all():
         raise ConfigurationError(f"{name}: {column} of row {int(np.flatnonzero(~whole)[0])} is no whole number")
     return values.to_numpy(np.int64)
@@ -246,7 +248,7 @@ def read_cameras(data: bytes, name: str) -> Cameras:
     try:
         content = json.loads(data)
         views = content["views"]
-        poses = {int(view["view_id"]): _pose(view) for view in views}
+        poses = {_whole(view["view_id"]): _pose(view) for view in views}
         doubled = len(poses) < len(views)
         datum = Datum(content["datum"]["name"], content["datum"]["radii_km"]) if "datum" in content else wgs84()
         mounting, geoid = content.get("vehicle", {}), content.get("geoid")
@@ -257,13 +259,15 @@ def read_cameras(data: bytes, name: str) -> Cameras:
         )  # fmt: skip
         arcs = tuple(_arc(arc) for arc in content.get("arcs", []))
     except (ValueError, TypeError, KeyError, AttributeError) as error:
-        what = f"no {error}" if isinstance(error, KeyError) else str(error)
+        what = f"no {error}" if isinstance(error, KeyError) else f"cannot be read as cameras: {error}"
         raise ConfigurationError(f"{name}: {what}") from error
     except (MatchError, ContractError) as error:
         # A record's own check, of what the file says.
         raise ConfigurationError(f"{name}: {error}") from error
     if doubled:
         raise ConfigurationError(f"{name}: a view is given twice")
+    if len({arc.arc_id for arc in arcs}) < len(arcs):
+        raise ConfigurationError(f"{name}: an arc is given twice")
     return Cameras(calibration, poses, arcs)
 
 
@@ -281,10 +285,22 @@ def _pose(view: dict[str, FloatArray]) -> Pose:
 def _arc(arc: dict[str, FloatArray]) -> Arc:
     views: list[dict[str, FloatArray]] = arc["views"]  # type: ignore[assignment]
     options: dict[str, float] = dict(arc.get("options", {}))
-    return Arc(
-        str(arc["arc_id"]), options,
-        tuple(ArcView(int(v["view_id"]), float(v["et"]), _pose(v), bool(v.get("throttled", False))) for v in views),
-    )  # fmt: skip
+    name, members = str(arc["arc_id"]), []
+    for view in views:
+        et = float(view["et"])
+        if not np.isfinite(et) or (members and not et > members[-1].et):
+            raise MatchError(f"arc {name}: view {view['view_id']} has no time, or one that is not later than the last")
+        members.append(ArcView(_whole(view["view_id"]), et, _pose(view), bool(view.get("throttled", False))))
+    if not members:
+        raise MatchError(f"arc {name} has no views")
+    return Arc(name, options, tuple(members))
+
+
+def _whole(value: object) -> int:
+    """A view's number; anything else is refused, not rounded."""
+    if not isinstance(value, int) or isinstance(value, bool):
+        raise ValueError(f"view_id {value!r} is no whole number")
+    return value
 
 
 def _camera(content: dict[str, FloatArray]) -> CameraModel:

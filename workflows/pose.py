@@ -19,6 +19,7 @@ from pipeline.pose.estimator import OpenCVGtsamPoseEstimator, PoseOptions, place
 from pipeline.pose.records import (
     CameraCalibration,
     CovarianceDegradedWarning,
+    PnpFailure,
     PnpFailureError,
     Pose,
     PoseEstimate,
@@ -38,13 +39,15 @@ from pipeline.pose.views import (
     triangulate_views,
     turned,
 )
-from pipeline.records import FloatArray
+from pipeline.records import BoolArray, FloatArray
 
 _FRAME = (
     "x_cam = camera_from_body (X - position), quaternion of camera_from_body scalar first; cov: upper triangle by rows "
     "of the errors (x, y, z, rx, ry, rz), km and rad, body-fixed, position estimated minus true and "
     "body_from_camera_true = Exp(r) body_from_camera_estimated"
 )
+# A place written twice, in whatever precision.
+_SAME_PLACE_KM = 1e-3
 _TO_BODY = (
     "; positions as in the cameras' file: vectors from the camera to the body, x_cam = camera_from_body (X + position)"
 )
@@ -114,12 +117,35 @@ class Views:
         return triangulate_views(self.calibration.camera, self.sightings, poses, len(self.points), sigma, robust)
 
 
+def unusable_sightings(views: Views) -> int:
+    """Sightings in views with given poses that cannot help to place points, since they are not finite.
+
+    Parameters
+    ----------
+    views
+        Of :func:`prepare`.
+
+    Returns
+    -------
+    int
+        Their number.
+    """
+    theirs = np.isin(views.sightings.view, list(views.given))
+    return int((theirs & ~np.isfinite(views.sightings.pixels_vu).all(axis=1)).sum())
+
+
 def _given_places(views: Views) -> Intersections:
     table, count = views.table, len(views.points)
     assert table.points_km is not None
-    # The file repeats a point's place in every row; the first is the one that counts.
-    _, first = np.unique(table.point_id, return_index=True)
+    # The file repeats a point's place in every row; one that is not finite fails its own view alone.
+    whole = np.isfinite(table.points_km).all(axis=1)
+    order = np.lexsort((np.arange(len(whole)), ~whole, table.point_id))
+    first = order[np.unique(table.point_id[order], return_index=True)[1]]
     places = table.points_km[first]
+    rows = np.flatnonzero(whole)
+    away = np.abs(table.points_km[rows] - places[views.sightings.point[rows]]).max(axis=1) > _SAME_PLACE_KM
+    if away.any():
+        raise ConfigurationError(f"point {table.point_id[rows[away][0]]} has more than one place")
     spread = np.zeros((count, 3, 3)) if table.point_covariance_km2 is None else table.point_covariance_km2[first]
     return Intersections(places, spread, np.zeros(count, dtype=np.int64))
 
@@ -199,7 +225,8 @@ def solve_views(views: Views, budget: Budget, every: bool) -> Iterable[PoseRow]:
         if view in views.given and not every:
             continue
         mine = places if view not in views.given or views.table.points_km is not None else views.places(view)
-        matches = matches_of(str(view_id), views.sightings, views.sightings.view == view, mine, exact)
+        rows = views.sightings.view == view
+        matches = _refused(views, rows) or matches_of(str(view_id), views.sightings, rows, mine, exact)
         if isinstance(matches, PnpFailureError):
             yield PoseRow(int(view_id), matches)
             continue
@@ -211,6 +238,16 @@ def solve_views(views: Views, budget: Budget, every: bool) -> Iterable[PoseRow]:
             answer = solve_view(estimator, views.calibration, matches, state)
         emitted = time.monotonic_ns() if isinstance(answer, PoseEstimate) else None
         yield PoseRow(int(view_id), answer, time.monotonic() - begun, emitted)
+
+
+def _refused(views: Views, rows: BoolArray) -> PnpFailureError | None:
+    """What is wrong with the places that a view's own rows give its points."""
+    if views.table.points_km is None:
+        return None
+    bad = np.flatnonzero(~np.isfinite(views.table.points_km[rows]).all(axis=1))
+    if not len(bad):
+        return None
+    return PnpFailureError(PnpFailure.BAD_INPUT, f"{len(bad)} of its points have a place that is not finite")
 
 
 def bundle_views(views: Views, rows: list[PoseRow], sigma_km: float, sigma_rad: float) -> list[PoseRow]:

@@ -150,7 +150,7 @@ def _of_file(
 ) -> int:  # fmt: skip
     """Poses of a file's views; their exit code."""
     from catalogs.matches import read_cameras, read_matches
-    from workflows.pose import bundle_views, pose_table, prepare, solve_views
+    from workflows.pose import bundle_views, pose_table, prepare, solve_views, unusable_sightings
 
     matches, cameras, output = paths
     (every, bundle, given_sigma_km, given_sigma_mrad), (arcs, cluster) = how, then
@@ -165,6 +165,9 @@ def _of_file(
             f"{cameras}: the given cameras look away from their points; positions are read, and written, as vectors "
             "from the camera to the body", err=True,
         )  # fmt: skip
+    lost = unusable_sightings(views)
+    if lost:
+        typer.echo(f"{matches}: {lost} sightings of views with given poses are not finite, and left out", err=True)
     rows = list(solve_views(views, budget, every))
     if bundle:
         rows = bundle_views(views, rows, given_sigma_km, 1e-3 * given_sigma_mrad)

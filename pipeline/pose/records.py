@@ -17,6 +17,8 @@ from pipeline.geometry.wgs84 import Datum, Geoid
 from pipeline.records import BoolArray, CameraModel, FloatArray, Record
 
 _UNIT = np.eye(3)
+# Pixels or kilometres that no instrument has and no body is at.
+_BEYOND = 1e15
 _FRAME_NAMESPACE = uuid5(NAMESPACE_URL, "pilotage/frame")
 
 
@@ -227,7 +229,7 @@ class MatchResult(Record):
             point_covariance_km2=(n, 3, 3),
         )  # fmt: skip
         for name in names[:2]:
-            bad = ~np.isfinite(getattr(self, name)).all(axis=1)
+            bad = ~(np.abs(getattr(self, name)) < _BEYOND).all(axis=1)
             if bad.any():
                 raise MatchError(f"{self.image_id}: {name}: {_rows(bad)} not finite")
         if len(np.unique(self.point_id)) != n:

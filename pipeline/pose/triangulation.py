@@ -198,7 +198,7 @@ class Intersections(Record):
 
 def _sums(index: NDArray[np.int64], values: FloatArray, count: int) -> FloatArray:
     """Sums of (n, ...) values by index."""
-    flat = values.reshape(len(values), -1)
+    flat = values.reshape(len(values), int(np.prod(values.shape[1:])))
     total = np.stack([np.bincount(index, flat[:, k], minlength=count) for k in range(flat.shape[1])], axis=1)
     return np.asarray(total.reshape(count, *values.shape[1:]))
 
@@ -316,7 +316,7 @@ def _without_each(lines: LinesOfSight, rows: NDArray[np.int64]) -> tuple[NDArray
 
 
 def _residuals_of(lines: LinesOfSight, place: NDArray[np.int64]) -> FloatArray:
-    """(n,) squared residuals of lines from where those of the same place meet; places are numbered anew, few or many."""
+    """(n,) squared residuals of lines from where those of the same place meet, in time that few places need."""
     distinct, rank = np.unique(place, return_inverse=True)
     alone = replace(lines, index=rank.astype(np.int64))
     return _squared_residuals(alone, intersect_lines(alone, len(distinct)))

@@ -26,6 +26,8 @@ from pipeline.pose.triangulation import (
 )
 from pipeline.records import BoolArray, CameraModel, FloatArray, Record
 
+# No array is so large.
+_BEYOND_PX = 1e9
 # Share of the places behind the cameras at which it is the positions that are written the other way round.
 _LOOKING_AWAY = 0.9
 
@@ -87,8 +89,9 @@ def triangulate_views(
     """
     known = np.isin(sightings.view, list(poses))
     view, point = sightings.view[known], sightings.point[known]
-    plane = to_plane(camera, sightings.pixels_vu[known], sightings.covariance(sigma_px)[known])
-    # A sighting without an honest sigma fails its own view, and no other.
+    # A sighting without an honest place or sigma fails its own view, and no other.
+    pixels = np.where(np.abs(sightings.pixels_vu[known]) < _BEYOND_PX, sightings.pixels_vu[known], np.nan)
+    plane = to_plane(camera, pixels, sightings.covariance(sigma_px)[known])
     spread = sightings.covariance(sigma_px)[known]
     good = plane.ok & np.isfinite(spread).all(axis=(1, 2)) & (spread[:, 0, 0] > 0) & (np.linalg.det(spread) > 0)
     order = np.array(sorted(poses))

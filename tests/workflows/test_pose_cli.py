@@ -158,6 +158,32 @@ def test_a_bundle_is_better_than_views_alone(tmp_path: Path) -> None:
     assert "fewer than two" in str(refused)
 
 
+def test_a_place_that_is_not_finite_fails_its_own_view_alone(tmp_path: Path) -> None:
+    table, poses, points = _views(2)
+    table = table[table.view_id < 30].reset_index(drop=True)
+    table[["x_km", "y_km", "z_km"]] = points[table.point_id - 7]
+    table["cov_vv"], table["cov_vu"], table["cov_uu"] = 0.0625, 0.0, 0.0625
+    table.loc[[3, 4], "y_km"] = [np.inf, np.nan]
+    table.loc[table.index[table.view_id == 10][0], "u_px"] = 1e300
+    table.to_parquet(tmp_path / "m.parquet")
+    code, text, _ = _run(tmp_path / "m.parquet", _cameras(tmp_path, poses, []), tmp_path / "p.parquet")
+    assert code == 1
+    assert text.count("view 0: 2 of its points have a place that is not finite") == 1
+    assert text.count("view 10: 10: pixels_vu: row 0 not finite") == 1
+    assert pd.read_parquet(tmp_path / "p.parquet").x_km.notna().tolist() == [False, False, True]
+
+
+def test_given_views_without_a_finite_sighting_place_no_point(tmp_path: Path) -> None:
+    table, poses, _ = _views(4)
+    table.loc[table.view_id != 40, "v_px"] = np.nan
+    table.to_parquet(tmp_path / "m.parquet")
+    cameras = _cameras(tmp_path, poses, [0, 1, 2, 3, 5, 6, 7, 8])
+    code, text, _ = _run(tmp_path / "m.parquet", cameras, tmp_path / "p.parquet")
+    assert code == 1
+    assert "sightings of views with given poses are not finite, and left out" in text
+    assert "view 40: 0 matches, 6 are needed" in text
+
+
 def _broken(kind: str, table: pd.DataFrame) -> pd.DataFrame:
     if kind == "nan":
         table.loc[table.index[table.view_id == 40][5], "v_px"] = np.nan
@@ -190,6 +216,8 @@ def test_a_bad_view_is_one_line_and_the_others_stay(tmp_path: Path, kind: str, v
     (lambda t: t.assign(cov_vv=1.0), "cov_vv without the others"), (lambda t: t.assign(x_km=0.0), "x_km without"),
     (lambda t: t.assign(view_id=t.view_id + 0.5), "view_id of row 0 is no whole number"),
     (lambda t: t.assign(v_px="a"), "v_px hold no numbers"),
+    (lambda t: t.assign(point_id=t.point_id * 1e18), "point_id of row 0 is no whole number"),
+    (lambda t: t.assign(x_km=np.arange(len(t)) * 1.0, y_km=0.0, z_km=0.0), "has more than one place"),
 ])  # fmt: skip
 def test_a_bad_table_is_one_error(tmp_path: Path, change, message: str) -> None:  # type: ignore[no-untyped-def]
     table, poses, _ = _views(4)
@@ -210,6 +238,11 @@ def test_a_bad_table_is_one_error(tmp_path: Path, change, message: str) -> None:
     (lambda c: c.update(geoid={"lat_deg": [1, 0], "lon_deg": [0, 1], "height_m": [[0, 0], [0, 0]]}), "ascending"),
     (lambda c: c.update(vehicle={"camera_from_vehicle": [[1, 0, 0]] * 3}), "camera_from_vehicle is not a rotation"),
     (lambda c: c.update(views=3), "not iterable"),
+    (lambda c: c["views"][0].update(view_id=1.5), "view_id 1.5 is no whole number"),
+    (lambda c: c.update(datum="x"), "cannot be read as cameras"),
+    (lambda c: c.update(arcs=[{"arc_id": "a", "views": []}]), "arc a has no views"),
+    (lambda c: c.update(arcs=[{"arc_id": "a", "views": [{**c["views"][0], "et": float("nan")}]}]), "has no time"),
+    (lambda c: c.update(arcs=[{"arc_id": "a", "views": [{**c["views"][0], "et": 1.0}]}] * 2), "arc is given twice"),
 ])  # fmt: skip
 def test_bad_cameras_are_one_error(tmp_path: Path, change, message: str) -> None:  # type: ignore[no-untyped-def]
     table, poses, _ = _views(4)

@@ -138,7 +138,7 @@ def test_bad_arcs_are_one_error(flight: Path, tmp_path: Path) -> None:
     content = json.loads((flight / "cameras.json").read_text())
     for change, message in (
         (lambda arc: arc["options"].update(walk_km_per_sqrt_s=-1.0), "options.walk_km_per_sqrt_s"),
-        (lambda arc: arc["views"].reverse(), "not later"), (lambda arc: arc["views"].clear(), "without images"),
+        (lambda arc: arc["views"].reverse(), "not later"), (lambda arc: arc["views"].clear(), "has no views"),
         (lambda arc: arc.pop("arc_id"), "no 'arc_id'"),
     ):  # fmt: skip
         broken = json.loads(json.dumps(content))
