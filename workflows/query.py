@@ -91,7 +91,7 @@ def ask_many(folder: RunFolder, steps: Mapping[str, str], questions: Mapping[str
 
 
 def _view(database: duckdb.DuckDBPyConnection, name: str, table: ds.Dataset) -> None:
-    """A table by DuckDB's own reader, a third of the memory of Arrow's (measured); a column that no file has is null."""
+    """A table by DuckDB's own reader, in a third of Arrow's memory (measured); columns that no file has are null."""
     empty = f"no_{name}"
     database.register(empty, table.schema.empty_table())
     files = ", ".join("'" + path.replace("'", "''") + "'" for path in getattr(table, "files", []))
