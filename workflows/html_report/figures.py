@@ -222,6 +222,8 @@ def arrows(field: pd.DataFrame, cells: int, titles: tuple[str, str]) -> tuple[go
             marker={"color": colour, "symbol": SYMBOLS[k % len(SYMBOLS)], "size": 5},
         )  # fmt: skip
     _layout(figure, *titles)
-    figure.update_xaxes(range=[0, 1])
-    figure.update_yaxes(range=[1, 0])
+    # A square, so that arrows keep their directions.
+    figure.update_layout(height=2 * _HEIGHT)
+    figure.update_xaxes(range=[0, 1], constrain="domain")
+    figure.update_yaxes(range=[1, 0], constrain="domain", scaleanchor="x")
     return figure, unit

@@ -15,7 +15,7 @@ from plotly.offline import get_plotlyjs
 
 from pipeline.curate import Json
 from workflows.html_report.figures import arrows, bars, histogram, scatter, trend
-from workflows.html_report.rows import FIELD_CELLS, MOST_PULL, Change, RunRows, strangest
+from workflows.html_report.rows import FEWEST_IN_CELL, FIELD_CELLS, MOST_PULL, Change, RunRows, strangest
 from workflows.html_report.style import SCRIPT, STYLE
 from workflows.html_report.trend import spells, worse_than_usual
 
@@ -221,11 +221,12 @@ def _trend(lately: pd.DataFrame) -> str:
 
 def _field(rows: RunRows) -> str:
     if not len(rows.field):
-        return _section("Residuals over the array", "<p>No feature has a measured place.</p>")
+        return _section("Residuals over the array", f"<p>No cell holds {FEWEST_IN_CELL} measured features.</p>")
     figure, unit = arrows(rows.field, FIELD_CELLS, ("u, share of the columns", "v, share of the rows"))
     said = (
-        f"Measured minus fitted places of used features, mean of {FIELD_CELLS} by {FIELD_CELLS} cells: an arrow "
-        f"from the cell's middle to its mark, a cell long for {unit:.3g} px. A pattern is what the camera model lacks."
+        f"Measured minus fitted places of used features, mean of {FIELD_CELLS} by {FIELD_CELLS} cells that hold "
+        f"{FEWEST_IN_CELL} or more: an arrow from the cell's middle to its mark, a cell long for {unit:.3g} px. "
+        "A pattern is what the camera model lacks."
     )
     return _section("Residuals over the array", _figure(figure, "residuals", said))
 

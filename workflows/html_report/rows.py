@@ -15,6 +15,8 @@ MOST_PULL = 4.0
 """Joint sigmas beyond which two techniques are said to disagree."""
 FIELD_CELLS = 12
 """Cells of the residual map along each side of the array."""
+FEWEST_IN_CELL = 5
+"""Features of a cell whose mean is shown: the map is of what images share."""
 _SHOWN_PAIRS = 1000
 
 # Two techniques on one image: the second one's offset d about its pivot p, moved to the first one's pivot c, is
@@ -101,7 +103,7 @@ _QUESTIONS = {
         from features join cells using (image_id)
         where used and sigma_px > 0 and residual_v_px is not null and residual_u_px is not null
             and measured_v_px between -0.5 and rows - 0.5 and measured_u_px between -0.5 and columns - 0.5
-        group by all order by all
+        group by all having count(*) >= {FEWEST_IN_CELL} order by all
     """,
 }
 
