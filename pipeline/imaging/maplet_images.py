@@ -411,7 +411,7 @@ def prepare_maplet(view: MapletView, maplet: Maplet, options: MapletImageOptions
 
 def images_of(
     prepared: PreparedMaplet, picture: tuple[Image, BoolArray], pixels_vu: FloatArray, jacobian: FloatArray,
-    options: MapletImageOptions,
+    options: MapletImageOptions, background: float = 0.0,
 ) -> MapletImages:  # fmt: skip
     """Extract and filter one maplet.
 
@@ -427,6 +427,8 @@ def images_of(
         (2, 2) pixels per cell at the landmark.
     options
         Filter.
+    background
+        DN that a cell without light has (3.43): what is dark is told above it.
 
     Returns
     -------
@@ -437,7 +439,8 @@ def images_of(
     area = abs(float(np.linalg.det(jacobian)))
     extracted, there = extract_image(*picture, pixels_vu, sqrt(area))
     cut = np.pad(prepared.hidden, widening)
-    dark = there & (extracted <= options.shadow_level * float(extracted[there].mean())) if there.any() else ~there
+    mean = float(extracted[there].mean()) if there.any() else 0.0
+    dark = there & (extracted - background <= options.shadow_level * (mean - background))
     cut |= dark | extend_shadows(dark, prepared.sun, shadow_reach(1.0 / sqrt(area)))
     inner = slice(widening, widening + len(prepared.predicted))
     valid = there & ~cut

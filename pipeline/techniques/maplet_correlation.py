@@ -11,10 +11,18 @@ from typing import Literal
 
 import numba
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
 from pipeline.geometry.maplet import Maplet, MapletView
-from pipeline.imaging.maplet_images import MapletImageOptions, MapletImages, grid_pixels, images_of, prepare_maplet
+from pipeline.imaging.maplet_images import (
+    MapletImageOptions,
+    MapletImages,
+    brightness_scale,
+    grid_pixels,
+    images_of,
+    prepare_maplet,
+)
 from pipeline.options import Options
 from pipeline.records import BoolArray, FloatArray, Image, Record
 
@@ -96,6 +104,8 @@ class LandmarkMatch(Record):
         Of the last correlation.
     images
         The last pair.
+    scale, background
+        What turns predicted light into DN (eq. 3.42-3.45), of the last correlation that found something; 0 before.
     """
 
     status: PeakStatus
@@ -105,6 +115,8 @@ class LandmarkMatch(Record):
     cells: int
     bin: int
     images: MapletImages
+    scale: float = 0.0
+    background: float = 0.0
 
     def __post_init__(self) -> None:
         self._freeze(offset_vu=(2,), covariance_px2=(2, 2))
@@ -304,7 +316,10 @@ def _nothing(status: PeakStatus, height: float) -> Peak:
 
 
 def _regression(
-    predicted: tuple[FloatArray, BoolArray], extracted: tuple[FloatArray, BoolArray], start: np.ndarray, block: int
+    predicted: tuple[FloatArray, BoolArray],
+    extracted: tuple[FloatArray, BoolArray],
+    start: NDArray[np.int64],
+    block: int,
 ) -> tuple[FloatArray, FloatArray, int]:
     """Shift beyond a whole one in binned cells, its covariance, and how many cells they rest on.
 
@@ -313,9 +328,7 @@ def _regression(
     """
     (p, mp), (e, me) = predicted, extracted
     n, m = len(p), len(e)
-    low, high = np.maximum(0, -start), np.minimum(n, m - start)
-    here = tuple(slice(int(a), int(b)) for a, b in zip(low, high, strict=True))
-    there = tuple(slice(int(a + s), int(b + s)) for a, b, s in zip(low, high, start, strict=True))
+    here, there = _overlap(n, m, start)
     p, mp, e, me = p[here], mp[here], e[there], me[there]
     valid = mp & me
     # A derivative needs both neighbours.
@@ -400,7 +413,7 @@ def locate(
     """
     make, match = options
     pixels_per_cell = float(np.sqrt(abs(np.linalg.det(jacobian))))
-    offset = np.asarray(start_vu, float)
+    offset, scale, background = np.asarray(start_vu, float), 0.0, 0.0
     bins = ladder(match.bin_start, match.every_bin)
     prepared, grid, before = prepare_maplet(view, maplet, make), grid_pixels(view, maplet), 0
     for step, size in enumerate(bins + (1,) * (match.passes - 1)):
@@ -408,14 +421,36 @@ def locate(
         widening = search if search * pixels_per_cell > _WIDE_SEARCH_PX else 0
         if widening != before:
             grid, before = grid_pixels(view, maplet, widening), widening
-        images = images_of(prepared, picture, grid + offset, jacobian, make)
+        images = images_of(prepared, picture, grid + offset, jacobian, make, background)
         peak = correlate(images, size, pixels_per_cell, match, step >= len(bins) - 1)
         if peak.status is not PeakStatus.FOUND:
             break
         offset = offset + jacobian @ peak.shift_cells
+        scale, background = _levels(images, peak, make.background_guard)
         if step >= len(bins) - 1 and np.abs(peak.shift_cells).max() < match.tolerance_cells:
             break
     found = peak.status is PeakStatus.FOUND
     covariance = jacobian @ peak.covariance_cells2 @ jacobian.T
     place = offset if found else np.full(2, np.nan)
-    return LandmarkMatch(peak.status, place, covariance, peak.correlation, peak.cells, size, images)
+    return LandmarkMatch(
+        peak.status, place, covariance, peak.correlation, peak.cells, size, images, scale, background
+    )  # fmt: skip
+
+
+def _levels(images: MapletImages, peak: Peak, guard: float) -> tuple[float, float]:
+    """Scale and background of a picture at the nearest whole shift."""
+    widening = (len(images.extracted) - len(images.predicted)) // 2
+    here, there = _overlap(
+        len(images.predicted), len(images.extracted), np.rint(peak.shift_cells).astype(int) + widening
+    )
+    valid = images.predicted_valid[here] & images.extracted_valid[there]
+    if not valid.any():
+        return 0.0, 0.0
+    return brightness_scale(images.predicted[here][valid], images.extracted[there][valid], peak.correlation, guard)
+
+
+def _overlap(n: int, m: int, start: NDArray[np.int64]) -> tuple[tuple[slice, ...], tuple[slice, ...]]:
+    """Parts of an (n, n) and an (m, m) image that cover each other, the first one beginning at a cell of the second."""
+    low, high = np.maximum(0, -start), np.minimum(n, m - start)
+    here = tuple(slice(int(a), int(b)) for a, b in zip(low, high, strict=True))
+    return here, tuple(slice(int(a + s), int(b + s)) for a, b, s in zip(low, high, start, strict=True))

@@ -128,6 +128,22 @@ def test_eq_3_67_landmarks_are_found_where_the_picture_has_them(
     assert np.sqrt(np.diag(match.covariance_px2)).max() < 0.1
 
 
+def test_eq_3_43_and_3_45_levels_of_a_picture_come_with_the_match() -> None:
+    maplet = maplet_on(SURFACE, 49, 0.05)
+    view = view_down(0.05, 0.35, 0.6, SUN, 140)
+    phase = np.arccos(view.sun @ view.position_km / 100.0)
+    image = picture_of(SURFACE, view, np.zeros(2), float(np.exp(-np.degrees(phase) / 60)))
+    jacobian = maplet_jacobian(view, index_of([maplet]), np.array([0]))[0]
+    good, options = np.ones(image.shape, bool), (MapletImageOptions(), CorrelationOptions())
+    plain = locate(view, maplet, (image.astype(np.float32), good), jacobian, np.zeros(2), options)
+    raised = locate(view, maplet, ((3.0 * image + 500.0).astype(np.float32), good), jacobian, np.zeros(2), options)
+    assert raised.scale == pytest.approx(3.0 * plain.scale, rel=0.02)
+    assert raised.background == pytest.approx(3.0 * plain.background + 500.0, abs=0.06 * plain.scale)
+    # What is dark is told above the background: nothing of the surface is lost to it, and nothing is gained.
+    assert raised.offset_vu == pytest.approx(plain.offset_vu, abs=0.02)
+    assert raised.images.removed == pytest.approx(plain.images.removed, abs=30)
+
+
 def test_errors_of_noise_are_as_large_as_stated() -> None:
     maplet = maplet_on(SURFACE, 30, 0.05)
     view = view_down(0.05, 0.2, 0.6, SUN, 90)
