@@ -35,6 +35,9 @@ _ALIGNMENT_PX = 1.0
 _USABLE_BINS = REACH - 1
 # Radius within which a landmark counts as where the others say, for the chance that mere luck put it there.
 _AGREEMENT_PX = 1.5
+# What a wrong position or scale leaves of landmarks is smooth over a picture: a quadratic has six coefficients, so many
+# independent draws are its misfits worth, however many the landmarks.
+_SMOOTH_DRAWS = 6
 
 
 class SurfaceFeatureOptions(TechniqueOptions):
@@ -307,9 +310,11 @@ def _answer(
     if confidence < options.least_confidence:
         detail = f"{body.name}: {agreeing} of {len(table)} landmarks agree, as they may by luck"
         return TechniqueFailure(NAME, StatusReason.NO_MATCH, detail)
+    spread = table.observed_vu[table.used] - fit.pivot_vu
+    information = with_misfit(fit.information, fit.extra_sigma_px, float(np.sqrt((spread**2).sum(axis=1).mean())))
     at_edge, at_edge_rotation = edge_flags(fit.centre_offset_vu, fit.rotation_rad, context, options)
     return TechniqueResult(
-        technique=NAME, offset_vu=fit.offset_vu, rotation_rad=fit.rotation_rad, information=fit.information,
+        technique=NAME, offset_vu=fit.offset_vu, rotation_rad=fit.rotation_rad, information=information,
         pivot_vu=fit.pivot_vu, confidence=confidence, measurements=agreeing,
         at_edge=at_edge, at_edge_rotation=at_edge_rotation, error_sources=(f"body:{body.name}",),
         diagnostics={
@@ -317,6 +322,30 @@ def _answer(
             "extra_sigma_px": fit.extra_sigma_px, "alignment_correlation": alignment.correlation,
         },
     )  # fmt: skip
+
+
+def with_misfit(information: FloatArray, extra_sigma_px: float, radius_px: float) -> FloatArray:
+    """Information of a pointing once what its landmarks leave unexplained counts as few draws.
+
+    Parameters
+    ----------
+    information
+        (2, 2) or (3, 3) about the landmarks' centroid, singular where a direction is not observed.
+    extra_sigma_px
+        Per-axis scatter beyond the stated sigmas.
+    radius_px
+        Root mean square distance of the landmarks from their centroid.
+
+    Returns
+    -------
+    numpy.ndarray
+        Inverse of the covariance S + D with D the misfit's, written for S's inverse.
+    """
+    shares = np.array([1.0, 1.0, 1.0 / max(radius_px, 1.0) ** 2])[: len(information)]
+    variance = shares * extra_sigma_px**2 / _SMOOTH_DRAWS
+    if extra_sigma_px <= 0.0:
+        return information
+    return np.asarray(information - information @ np.linalg.inv(information + np.diag(1.0 / variance)) @ information)
 
 
 def _confidence(agreeing: int, table: LandmarkTable, context: NavContext) -> float:

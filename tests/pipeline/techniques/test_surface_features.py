@@ -12,7 +12,7 @@ from pipeline.options import InstrumentSettings
 from pipeline.records import Attitude, Body, Detector, FloatArray, Spacecraft, State
 from pipeline.status import StatusReason
 from pipeline.techniques.base import TechniqueFailure, TechniqueResult
-from pipeline.techniques.surface_features import MapletSource, SurfaceFeatureOptions, surface_feature_nav
+from pipeline.techniques.surface_features import MapletSource, SurfaceFeatureOptions, surface_feature_nav, with_misfit
 from tests.pipeline.techniques.maplet_scene import maplet_on, picture_of, relief, view_down
 
 SURFACE = relief(9)
@@ -113,3 +113,13 @@ def test_a_picture_of_something_else_is_no_match() -> None:
     assert isinstance(unseen.answer, TechniqueFailure)
     assert unseen.answer.reason is StatusReason.NO_FEATURES_PREDICTED
     assert "49 outside_cone" in unseen.answer.detail
+
+
+def test_scatter_that_landmarks_share_is_added_to_the_covariance() -> None:
+    covariance = np.diag([1e-4, 4e-4, 1e-9])
+    added = np.diag([0.06, 0.06, 0.06 / 150.0**2])
+    found = np.linalg.inv(with_misfit(np.linalg.inv(covariance), 0.6, 150.0))
+    assert found == pytest.approx(covariance + added, rel=1e-6, abs=1e-15)
+    assert with_misfit(np.eye(2), 0.0, 150.0) == pytest.approx(np.eye(2))
+    # What is not observed stays so.
+    assert np.linalg.matrix_rank(with_misfit(np.diag([50.0, 50.0, 0.0]), 0.6, 150.0)) == 2
