@@ -17,6 +17,8 @@ _NAME_LETTERS = 16
 _NAME_SIZE = 11
 # Pieces whose robust weight is below this did not count.
 _COUNTED = 0.05
+# Ring edges that a piece places worse than this, in pixels, would be a cloud of dots.
+_PLACED_PX = 1.0
 _VECTOR_PX = 22.0
 _BOX = 9.0
 # A short line in the key.
@@ -187,21 +189,24 @@ def _rings(canvas: Canvas, document: Mapping[str, Json], shape: tuple[int, int])
     if not isinstance(block, dict) or not block["feature"]:
         return []
     found, counted = _vu(block, "{}_px"), np.array(block["weight"], dtype=float) > _COUNTED
+    placed = np.array(block["sigma_px"], dtype=float) <= _PLACED_PX
     names = [f"{name} {outer}" for name, outer in zip(block["feature"], block["outer"], strict=True)]  # type: ignore[arg-type]
     longitude = np.array(block["longitude_deg"], dtype=float)
     before = _uncorrected(found, document, shape)
     labelled = []
     for name in dict.fromkeys(names):
-        pieces = np.flatnonzero([each == name for each in names])
+        pieces = np.flatnonzero(placed & [each == name for each in names])
         pieces = pieces[np.argsort(longitude[pieces])]
         for run in _runs(canvas.places(before[pieces])):
             canvas.line(run, SKY)
         labelled.append((pieces, name.rpartition(" ")[0]))
-    _dots(canvas, canvas.places(found[counted]), canvas.places(found[~counted]), ORANGE)
+    used, refused = placed & counted, placed & ~counted
+    _dots(canvas, canvas.places(found[used]), canvas.places(found[refused]), ORANGE)
     _ring_names(canvas, [(canvas.places(found[pieces]), name) for pieces, name in labelled])
     keys = [Key(_piece_of_line, "ring edge before correction")]
-    keys.append(Key(lambda c, p: c.circles(p, 2.5, ORANGE, -1), f"ring edge found ({int(counted.sum())})"))
-    return keys + _refused(int((~counted).sum()))
+    faint = f", {int((~placed).sum())} too faint to show" if not placed.all() else ""
+    keys.append(Key(lambda c, p: c.circles(p, 2.5, ORANGE, -1), f"ring edge found ({int(used.sum())}{faint})"))
+    return keys + _refused(int(refused.sum()))
 
 
 def _ring_names(canvas: Canvas, edges: list[tuple[FloatArray, str]]) -> None:

@@ -176,8 +176,7 @@ def trend(bins: pd.DataFrame, y: str, titles: tuple[str, str], log_y: bool = Fal
             line={"color": COLOURS[k % len(COLOURS)], "dash": ("solid", "dash", "dot")[k % 3]},
             marker={"symbol": SYMBOLS[k % len(SYMBOLS)], "size": 7},
         )  # fmt: skip
-    if log_y:
-        figure.update_yaxes(type="log")
+    figure.update_yaxes(type="log") if log_y else figure.update_yaxes(rangemode="tozero")
     return _layout(figure, *titles)
 
 
