@@ -22,9 +22,12 @@ demo: install
 	$(BIN)/pilotage run $(DEMO)/flyby --output $(DEMO)/flyby-run --pictures all || test $$? -eq 1
 	$(BIN)/pilotage show $(DEMO)/flyby-run --truth $(DEMO)/flyby/truth.json --limit 24
 	$(BIN)/pilotage report $(DEMO)/flyby-run
+	$(BIN)/pilotage sample asteroid $(DEMO)/asteroid --images 2 --coverage 0.7
+	$(BIN)/pilotage run $(DEMO)/asteroid --output $(DEMO)/asteroid-run || test $$? -eq 1
+	$(BIN)/pilotage show $(DEMO)/asteroid-run --truth $(DEMO)/asteroid/truth.json
 	$(BIN)/pilotage sample aerial $(DEMO)/aerial
 	$(BIN)/pilotage pose $(DEMO)/aerial/matches.parquet --cameras $(DEMO)/aerial/cameras.json --output $(DEMO)/aerial/views.parquet --arcs $(DEMO)/aerial/arcs || test $$? -eq 1
-	@echo "The archives are in $(DEMO)/stars and $(DEMO)/flyby, the answers in $(DEMO)/run and $(DEMO)/flyby-run: offsets/ and the other tables, images/*.json. Open $(DEMO)/flyby-run/report.html in a browser."
+	@echo "The archives are in $(DEMO)/stars, $(DEMO)/flyby and $(DEMO)/asteroid, the answers in $(DEMO)/run, $(DEMO)/flyby-run and $(DEMO)/asteroid-run: offsets/ and the other tables, images/*.json. Open $(DEMO)/flyby-run/report.html in a browser."
 
 test: install
 	$(BIN)/python -m pytest -n 2

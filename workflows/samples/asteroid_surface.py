@@ -216,11 +216,16 @@ def _features(
     return centres, (low - rng.random(count) * (low - high)) ** (-1.0 / slope)
 
 
-def _figure(semi_axes_km: tuple[float, float, float], cells: int) -> FloatArray:
-    """Return the radius (6, n + 1, n + 1) of an ellipsoid."""
-    faces = [directions_of_face(face, cells) for face in range(FACES)]
-    radius: FloatArray = 1.0 / np.linalg.norm(np.stack(faces) / np.array(semi_axes_km), axis=-1)
-    return radius
+@numba.njit(cache=True)
+def _figure(radius, semi_axes):  # type: ignore[no-untyped-def]
+    """Fill maps with the radius of an ellipsoid."""
+    n = radius.shape[1] - 1
+    for face in range(FACES):
+        for row in range(n + 1):
+            for column in range(n + 1):
+                x, y, z = direction_of(face, 2.0 * row / n - 1.0, 2.0 * column / n - 1.0)
+                x, y, z = x / semi_axes[0], y / semi_axes[1], z / semi_axes[2]
+                radius[face, row, column] = 1.0 / np.sqrt(x * x + y * y + z * z)
 
 
 def directions_of_face(face: int, cells: int) -> FloatArray:
@@ -262,8 +267,9 @@ def make_asteroid(semi_axes_km: tuple[float, float, float], cells: int, seed: in
     heights = BOULDER_HEIGHT * sizes * rng.uniform(0.5, 1.0, BOULDERS)
     if fine:
         _stamp(relief, places, sizes, heights, True)
-    radius = (_figure(semi_axes_km, cells) + mean_km * relief).astype(np.float32)
-    albedo = np.zeros_like(relief)
+    radius, albedo = np.zeros_like(relief), np.zeros_like(relief)
+    _figure(radius, np.array(semi_axes_km))
+    radius = (radius + mean_km * relief).astype(np.float32)
     _fractal(albedo, 2.0, OCTAVES - 2, 2.0**-0.45, albedo_seed)
     # Boulders are a little brighter than what they lie on.
     _stamp(albedo, places, sizes, rng.uniform(-0.2, 1.0, BOULDERS), True)
