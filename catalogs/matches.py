@@ -285,7 +285,8 @@ def _pose(view: dict[str, FloatArray]) -> Pose:
 def _arc(arc: dict[str, FloatArray]) -> Arc:
     views: list[dict[str, FloatArray]] = arc["views"]  # type: ignore[assignment]
     options: dict[str, float] = dict(arc.get("options", {}))
-    name, members = str(arc["arc_id"]), []
+    name = str(arc["arc_id"])
+    members: list[ArcView] = []
     for view in views:
         et = float(view["et"])
         if not np.isfinite(et) or (members and not et > members[-1].et):

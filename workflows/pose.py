@@ -138,7 +138,7 @@ def _given_places(views: Views) -> Intersections:
     table, count = views.table, len(views.points)
     assert table.points_km is not None
     # The file repeats a point's place in every row; one that is not finite fails its own view alone.
-    whole = np.isfinite(table.points_km).all(axis=1)
+    whole: BoolArray = np.asarray(np.isfinite(table.points_km).all(axis=1))
     order = np.lexsort((np.arange(len(whole)), ~whole, table.point_id))
     first = order[np.unique(table.point_id[order], return_index=True)[1]]
     places = table.points_km[first]

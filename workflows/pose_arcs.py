@@ -27,6 +27,7 @@ from pipeline.pose.schemas import UPPER
 from pipeline.records import FloatArray
 from workflows.pose import PoseRow
 
+_TOLD = ("position_sigma_km", "walk_km_per_sqrt_s", "attitude_sigma_rad", "boresight_sigma_rad", "twist_sigma_rad")
 Row = dict[str, str | int | float | bool | None]
 
 
@@ -147,7 +148,8 @@ def smooth_members(identity: ArcIdentity, members: Sequence[ArcMember], options:
     except MatchError as error:
         raise ConfigurationError(f"arc {identity.arc_id}: {error}") from error
     poses = [_pose_row(identity, member, k, result) for k, member in enumerate(members)]
-    return SmoothedArc(poses, _arc_row(identity, members, result))
+    used: Row = {name: getattr(options, name) for name in _TOLD}
+    return SmoothedArc(poses, _arc_row(identity, members, result) | used)
 
 
 def table_of(rows: Sequence[Row], schema: pa.Schema) -> pa.Table:

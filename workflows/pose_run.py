@@ -17,7 +17,7 @@ from catalogs.matches import MatchTable, read_image_matches
 from pipeline.curate import Json
 from pipeline.errors import ConfigurationError
 from pipeline.pose.arc_factors import ArcImage
-from pipeline.pose.arcs import ArcOptions
+from pipeline.pose.arcs import ArcOptions, fitted_options
 from pipeline.pose.estimator import OpenCVGtsamPoseEstimator
 from pipeline.pose.records import (
     CovarianceDegradedWarning,
@@ -225,7 +225,8 @@ def solve_arc(job: ArcJob) -> ArcAnswer:
             "image_id": image_id, "stage": _STAGE, "seconds": time.monotonic() - begun,
             "emitted_at_ns": time.monotonic_ns() if isinstance(answer, PoseEstimate) else None,
         })  # fmt: skip
-    smoothed = smooth_members(job.identity, members, job.options.arc) if members else None
+    options = fitted_options([member.image for member in members], job.options.arc)
+    smoothed = smooth_members(job.identity, members, options) if members else None
     return ArcAnswer(smoothed, timings, tuple(troubles))
 
 

@@ -32,6 +32,9 @@ from pipeline.pose.se3 import SE3Utils
 from pipeline.records import BoolArray, FloatArray, Record
 
 _FIX_ROWS = 6
+# Median of the size of a normal variable.
+_MEDIAN_OF_NORMAL = 0.6745
+_ENOUGH_FIXES = 5
 # Columns of what holds an image: its landmark fix, its offset.
 _FIX, _OFFSET = 0, 1
 # Fixes taken back settle at once or in two or three rounds.
@@ -57,6 +60,46 @@ class ArcOptions(Options):
             self.position_sigma_km, self.walk_km_per_sqrt_s, self.attitude_sigma_rad, self.boresight_sigma_rad,
             self.twist_sigma_rad,
         )  # fmt: skip
+
+
+def fitted_options(images: Sequence[ArcImage], options: ArcOptions) -> ArcOptions:
+    """Uncertainties that nobody has told, as large as an arc's own fixes show them to be.
+
+    Medians bear with fixes that are wrong. A walk comes out too large by the fixes' own errors, never too small.
+
+    Parameters
+    ----------
+    images
+        In the order of time.
+    options
+        Fields that were set stay.
+
+    Returns
+    -------
+    ArcOptions
+        The same where fewer than five images have a fix.
+    """
+    fixed = [(image, image.fix) for image in images if image.fix is not None]
+    if len(fixed) < _ENOUGH_FIXES:
+        return options
+    away = np.array([image.prior.position_km - fix.pose.position_km for image, fix in fixed])
+    turns = np.array([
+        SE3Utils.log(image.prior.camera_from_body @ fix.pose.camera_from_body.T) for image, fix in fixed
+    ])  # fmt: skip
+    bias = np.median(turns, axis=0)
+    seconds = np.diff([image.et for image, _ in fixed])[:, None]
+    found = {
+        "position_sigma_km": _spread(away), "walk_km_per_sqrt_s": _spread(np.diff(away, axis=0) / np.sqrt(seconds)),
+        "attitude_sigma_rad": _spread(turns - bias),
+        "boresight_sigma_rad": max(options.boresight_sigma_rad, float(np.abs(bias[:2]).max())),
+        "twist_sigma_rad": max(options.twist_sigma_rad, abs(float(bias[2]))),
+    }  # fmt: skip
+    return options.model_copy(update={k: v for k, v in found.items() if k not in options.model_fields_set and v > 0})
+
+
+def _spread(values: FloatArray) -> float:
+    """1 sigma of values about zero, by the median of their sizes."""
+    return float(np.median(np.abs(values))) / _MEDIAN_OF_NORMAL
 
 
 @dataclass(frozen=True, eq=False)

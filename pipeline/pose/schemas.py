@@ -79,4 +79,9 @@ ARC_SCHEMA = pa.schema([
     *[_field(f"bias_{name}_rad", _REAL, "rad", f"common {text} of the camera against its believed attitude")
       for name, text in (("x", "offset about x"), ("y", "offset about y"), ("twist", "twist about z"))],
     *[_field(f"sigma_bias_{name}_rad", _REAL, "rad", "1 sigma") for name in ("x", "y", "twist")],
+    _field("position_sigma_km", _REAL, "km", "1 sigma of the trajectory at the start, as told or as the fixes show it"),
+    _field("walk_km_per_sqrt_s", _REAL, "km s-1/2", "its random walk, told or shown"),
+    _field("attitude_sigma_rad", _REAL, "rad", "1 sigma of one believed attitude, told or shown"),
+    _field("boresight_sigma_rad", _REAL, "rad", "1 sigma of the common offset, told or shown"),
+    _field("twist_sigma_rad", _REAL, "rad", "1 sigma of the common twist, told or shown"),
 ])  # fmt: skip

@@ -258,8 +258,8 @@ def intersect_lines(
     return Intersections(places, covariance, refusal)
 
 
-def agreeing_lines(lines: LinesOfSight, count: int, gate_sigma: float = 4.3) -> BoolArray:
-    """Lines of sight that meet their place, so that one wrong line bends none.
+def intersect_agreeing(lines: LinesOfSight, count: int, gate_sigma: float = 4.3) -> Intersections:
+    """Places where lines of sight meet, weighted best, wrong lines left out so that they bend none.
 
     While a place has a line off by more than the gate, it is solved without each of its lines in turn, and the line
     without which the others agree best is left out if their chi2 falls by more than the gate's square. Of two lines
@@ -276,15 +276,30 @@ def agreeing_lines(lines: LinesOfSight, count: int, gate_sigma: float = 4.3) -> 
 
     Returns
     -------
-    numpy.ndarray
-        (n,) True for lines that stay.
+    Intersections
+        As of :func:`intersect_lines`.
     """
+    found = intersect_lines(lines, count)
+    keep = _agreeing(lines, _squared_residuals(lines, found), count, gate_sigma)
+    bent = np.unique(lines.index[~keep])
+    if not len(bent):
+        return found
+    rows = np.flatnonzero(keep & np.isin(lines.index, bent))
+    mended = intersect_lines(replace(lines.take(rows), index=np.searchsorted(bent, lines.index[rows])), len(bent))
+    places, covariance = found.places_km.copy(), found.covariance_km2.copy()
+    refusal = found.refusal.copy()
+    places[bent], covariance[bent], refusal[bent] = mended.places_km, mended.covariance_km2, mended.refusal
+    return Intersections(places, covariance, refusal)
+
+
+def _agreeing(lines: LinesOfSight, squared: FloatArray, count: int, gate_sigma: float) -> BoolArray:
+    """(n,) True for lines that stay, with what all lines leave at first."""
     keep = np.ones(len(lines.index), dtype=bool)
     suspect = np.ones(count, dtype=bool)
-    for _ in range(_MOST_OUTLIERS):
+    for number in range(_MOST_OUTLIERS):
         mine = np.flatnonzero(keep & suspect[lines.index])
         place = lines.index[mine]
-        squared = _residuals_of(lines.take(mine), place)
+        squared = _residuals_of(lines.take(mine), place) if number else squared
         worst, total = np.zeros(count), np.bincount(place, squared, minlength=count)
         np.maximum.at(worst, place, squared)
         suspect &= (worst > gate_sigma**2) & (np.bincount(place, minlength=count) > 2)
@@ -312,7 +327,8 @@ def _without_each(lines: LinesOfSight, rows: NDArray[np.int64]) -> tuple[NDArray
         line.append(order[first + other])
         base += size
     trials, members = np.concatenate(trial), np.concatenate(line)
-    return order, np.bincount(trials, _residuals_of(lines.take(members), trials), minlength=base)
+    rest: FloatArray = np.bincount(trials, _residuals_of(lines.take(members), trials), minlength=base).astype(float)
+    return order, rest
 
 
 def _residuals_of(lines: LinesOfSight, place: NDArray[np.int64]) -> FloatArray:

@@ -21,7 +21,7 @@ from pipeline.pose.triangulation import (
     Intersections,
     LinesOfSight,
     TriangulationMethod,
-    agreeing_lines,
+    intersect_agreeing,
     intersect_lines,
 )
 from pipeline.records import BoolArray, CameraModel, FloatArray, Record
@@ -99,9 +99,7 @@ def triangulate_views(
     turns = np.stack([poses[int(k)].camera_from_body for k in order])[row]
     centres = np.stack([poses[int(k)].position_km for k in order])[row]
     lines = LinesOfSight(point[good], plane.xy[good], plane.covariance[good], turns, centres)
-    if robust:
-        lines = lines.take(agreeing_lines(lines, count))
-    return intersect_lines(lines, count, TriangulationMethod.LOST)
+    return intersect_agreeing(lines, count) if robust else intersect_lines(lines, count, TriangulationMethod.LOST)
 
 
 def sigma_of(camera: CameraModel, sightings: Sightings, poses: dict[int, Pose], places_km: FloatArray) -> float:

@@ -17,7 +17,7 @@ from pipeline.pose.arc_factors import (
     direction_factor,
     step_factor,
 )
-from pipeline.pose.arcs import ArcOptions, ArcResult, GrowingArc, labels_of, smooth_arc
+from pipeline.pose.arcs import ArcOptions, ArcResult, GrowingArc, fitted_options, labels_of, smooth_arc
 from pipeline.pose.estimator import OpenCVGtsamPoseEstimator
 from pipeline.pose.graph import pose_key, resection_factor
 from pipeline.pose.records import CameraCalibration, MatchError, MatchResult, Pose, SourceLabel, ThermalState
@@ -224,3 +224,20 @@ def test_what_is_no_arc_is_refused() -> None:
             smooth_arc(wrong)
     with pytest.raises(MatchError, match="no time"):
         replace(images[0], et=np.nan)
+
+
+def test_uncertainties_that_nobody_told_come_from_the_fixes() -> None:
+    told = ArcOptions(position_sigma_km=4.0, walk_km_per_sqrt_s=0.2, attitude_sigma_rad=8e-4)
+    found = []
+    for seed in range(12):
+        images, _, _ = plant_arc(80, 50 + seed, told, gap=0.2, outliers=0.05)
+        fitted = fitted_options(images, ArcOptions(twist_sigma_rad=2e-3))
+        found.append([fitted.walk_km_per_sqrt_s, fitted.attitude_sigma_rad, fitted.position_sigma_km])
+        assert fitted.twist_sigma_rad == 2e-3
+    walk, attitude, position = np.median(found, axis=0)
+    # Steps span gaps between fixes too; each fix's own error of 0.05 km is a fifth of a step.
+    assert 0.19 < walk < 0.25
+    assert 7e-4 < attitude < 9.5e-4
+    assert 2.0 < position < 20.0
+    few, _, _ = plant_arc(80, 1, told, gap=0.99)
+    assert fitted_options(few, told) is told
