@@ -33,7 +33,13 @@ from pipeline.techniques.ring_search import RingFix, find_rings
 from pipeline.techniques.star_field import StarFieldOptions, star_field_nav
 from pipeline.techniques.star_refine import StarRefineOptions, star_refine_nav
 from pipeline.techniques.star_unique import StarUniqueOptions, star_unique_nav
-from pipeline.techniques.surface_features import MapletSource, SurfaceFeatureOptions, SurfaceFix, surface_feature_nav
+from pipeline.techniques.surface_features import (
+    MapletSource,
+    SurfaceFeatureOptions,
+    SurfaceFix,
+    surface_feature_nav,
+    without_trust_in_place,
+)
 
 
 class TechniquesOptions(Options):
@@ -167,6 +173,7 @@ def navigate(
         on_stage("rings")
     landmarks = _landmark_pass(maplets, frame, state, options.techniques.SurfaceFeatureNav)
     if landmarks is not None:
+        outcomes = _beside_landmarks(outcomes, landmarks, state, options.techniques.SurfaceFeatureNav)
         outcomes.append(landmarks.answer)
         on_stage("landmarks")
     if len(predicted) or not (len(scene) or len(rings) or landmarks):
@@ -194,6 +201,20 @@ def _landmark_pass(
     if body is None or not options.enabled:
         return None
     return surface_feature_nav(body, by_name[body.name.upper()], frame, state, options)
+
+
+def _beside_landmarks(
+    outcomes: list[_Outcome], landmarks: SurfaceFix, state: State, options: SurfaceFeatureOptions
+) -> list[_Outcome]:
+    """Other techniques' outcomes, less sure of what a wrong position changes where landmarks have solved for it."""
+    answer = landmarks.answer
+    if landmarks.state is None or isinstance(answer, TechniqueFailure):
+        return outcomes
+    body = next(body for body in state.bodies if f"body:{body.name}" in answer.error_sources)
+    return [
+        without_trust_in_place(outcome, body, state, options) if isinstance(outcome, TechniqueResult) else outcome
+        for outcome in outcomes
+    ]
 
 
 def _ring_pass(

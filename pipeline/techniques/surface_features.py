@@ -324,6 +324,39 @@ def _answer(
     )  # fmt: skip
 
 
+def without_trust_in_place(
+    result: TechniqueResult, body: Body, state: State, options: SurfaceFeatureOptions
+) -> TechniqueResult:
+    """Answer of a technique that takes the a-priori position for granted, once landmarks have shown it to be wrong.
+
+    Parameters
+    ----------
+    result
+        Of any technique.
+    body
+        Whose landmarks were found.
+    state
+        Geometry.
+    options
+        Of the landmarks: how well the position is known.
+
+    Returns
+    -------
+    TechniqueResult
+        With the error of the body's apparent size added per axis, as far as the array shows the body; results on other
+        bodies, and those of landmarks, stay as they are.
+    """
+    if result.technique == NAME or f"body:{body.name}" not in result.error_sources:
+        return result
+    scale = float(pixel_scale_rad(state.camera_model).mean())
+    radius = float(body.radii_km.mean()) / float(np.linalg.norm(body.position_km)) / scale
+    error_px = options.position_sigma_share * min(radius, float(max(state.camera_model.shape_vu)))
+    added = np.diag([error_px**2, error_px**2, 0.0][: len(result.information)])
+    # (S + D)^-1 = (1 + S^-1 D)^-1 S^-1, also where S^-1 is singular.
+    widened = np.linalg.solve(np.eye(len(added)) + result.information @ added, result.information)
+    return replace(result, information=(widened + widened.T) / 2.0)
+
+
 def with_misfit(information: FloatArray, extra_sigma_px: float, radius_px: float) -> FloatArray:
     """Information of a pointing once what its landmarks leave unexplained counts as few draws.
 

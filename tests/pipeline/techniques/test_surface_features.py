@@ -12,7 +12,13 @@ from pipeline.options import InstrumentSettings
 from pipeline.records import Attitude, Body, Detector, FloatArray, Spacecraft, State
 from pipeline.status import StatusReason
 from pipeline.techniques.base import TechniqueFailure, TechniqueResult
-from pipeline.techniques.surface_features import MapletSource, SurfaceFeatureOptions, surface_feature_nav, with_misfit
+from pipeline.techniques.surface_features import (
+    MapletSource,
+    SurfaceFeatureOptions,
+    surface_feature_nav,
+    with_misfit,
+    without_trust_in_place,
+)
 from tests.pipeline.techniques.maplet_scene import maplet_on, picture_of, relief, view_down
 
 SURFACE = relief(9)
@@ -123,3 +129,20 @@ def test_scatter_that_landmarks_share_is_added_to_the_covariance() -> None:
     assert with_misfit(np.eye(2), 0.0, 150.0) == pytest.approx(np.eye(2))
     # What is not observed stays so.
     assert np.linalg.matrix_rank(with_misfit(np.diag([50.0, 50.0, 0.0]), 0.6, 150.0)) == 2
+
+
+def test_a_wrong_place_makes_outlines_of_the_same_body_less_sure() -> None:
+    state = state_at(VIEW, False)
+    body, options = state.bodies[0], SurfaceFeatureOptions()
+    limb = TechniqueResult(
+        "BodyLimbNav", np.zeros(2), 0.0, np.diag([100.0, 0.0, 0.0]), np.zeros(2), 1.0, error_sources=("body:PLANE",)
+    )
+    # One kilometre seen from 100 km through pixels of 0.0005 rad.
+    error = options.position_sigma_share * (1.0 / np.linalg.norm(body.position_km)) / 0.0005
+    found = without_trust_in_place(limb, body, state, options)
+    assert 1.0 / found.information[0, 0] == pytest.approx(0.01 + error**2, rel=0.02)
+    assert np.linalg.matrix_rank(found.information) == 1
+    other = replace(limb, error_sources=("body:MOON",))
+    assert without_trust_in_place(other, body, state, options) is other
+    own = replace(limb, technique="SurfaceFeatureNav")
+    assert without_trust_in_place(own, body, state, options) is own
