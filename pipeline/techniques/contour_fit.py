@@ -228,7 +228,8 @@ def _middles(
         return np.asarray(np.stack(sums, axis=1) / number)
 
     normal, direction = mean(outline.normal_vu), mean(outline.direction)
-    normal /= np.linalg.norm(normal, axis=1)[:, None]
+    # Normals of a piece that folds back on itself cancel: it moves with nothing and shows no edge.
+    normal /= np.maximum(np.linalg.norm(normal, axis=1), np.finfo(float).tiny)[:, None]
     direction /= np.linalg.norm(direction, axis=1)[:, None]
     body = np.zeros(count, np.int64)
     body[piece] = outline.body[usable]
