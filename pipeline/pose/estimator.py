@@ -109,7 +109,8 @@ class OpenCVGtsamPoseEstimator:
         self._shared = shared
         self._ransac = RansacFilter(self.options.ransac)
         self._mode = CovarianceMode.MARGINALS
-        _log(logging.INFO, "C4 ready", estimator="opencv_gtsam", default_covariance=self._mode.name)
+        text = f"C4 ready: estimator=opencv_gtsam, default_covariance={self._mode.name}"
+        _log(logging.INFO, text, estimator="opencv_gtsam", default_covariance=self._mode.name)
 
     def current_covariance_mode(self) -> CovarianceMode:
         """Mode of the latest frame.
@@ -153,8 +154,9 @@ class OpenCVGtsamPoseEstimator:
         throttled = thermal_state.thermal_throttle
         self._mode = CovarianceMode.JACOBIAN if throttled else CovarianceMode.MARGINALS
         if throttled:
-            text = f"C4 covariance degraded to JACOBIAN on frame={match_result.image_id}"
             clock = thermal_state.clock_mhz
+            text = f"C4 covariance degraded to JACOBIAN on frame={match_result.image_id}; thermal_throttle=true"
+            text += "" if clock is None else f"; clock_mhz={clock:g}"
             _log(logging.WARNING, text, frame=match_result.image_id, thermal_throttle=True, clock_mhz=clock)
             warnings.warn(text, CovarianceDegradedWarning, stacklevel=2)
         try:
@@ -162,7 +164,9 @@ class OpenCVGtsamPoseEstimator:
             best = self._solve(matches)
         except PnpFailureError as error:
             _log(
-                logging.ERROR, f"C4 PnP failure on frame={match_result.image_id}; falling back to visual_propagated",
+                logging.ERROR,
+                f"C4 PnP failure on frame={match_result.image_id}; mode={self._mode.value}; falling back to "
+                "visual_propagated",
                 frame=match_result.image_id, mode=self._mode.value, reason=error.reason.value, detail=error.detail,
             )  # fmt: skip
             raise
@@ -307,10 +311,10 @@ class OpenCVGtsamPoseEstimator:
             pose, errors = best.fit.pose, covariance_of(best.fit.information)
         pixels, _ = project(calibration.camera, pose.to_camera(points))
         rms = np.sqrt(((matches.result.pixels_vu[best.inlier] - pixels) ** 2).mean(axis=0))
+        count, residual, name = int(best.inlier.sum()), round(float(np.hypot(*rms)), 3), matches.result.image_id
         _log(
-            logging.DEBUG, f"C4 frame={matches.result.image_id}", frame=matches.result.image_id,
-            inliers=int(best.inlier.sum()), residual_px=round(float(np.hypot(*rms)), 3), mode=self._mode.name,
-            method=best.method,
+            logging.DEBUG, f"C4 frame={name} inliers={count} residual={residual}px mode={self._mode.name}",
+            frame=name, inliers=count, residual_px=residual, mode=self._mode.name, method=best.method,
         )  # fmt: skip
         return PoseEstimate(
             frame_id_of(matches.result.image_id), matches.result.image_id, pose, place_of(pose, calibration),

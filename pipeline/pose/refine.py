@@ -184,16 +184,12 @@ def _spread(points, covariance, point_covariance, c, p):  # type: ignore[no-unty
 
 
 def squared_distances(pose: Pose, points_km: FloatArray, xy: FloatArray, covariance: FloatArray) -> FloatArray:
-    """Squared residuals on the ideal plane over their covariances.
+    """Squared residuals of :func:`plane_residuals` over their covariances.
 
     Parameters
     ----------
-    pose
-        The pose.
-    points_km
-        (n, 3) body-fixed.
-    xy
-        (n, 2) measured.
+    pose, points_km, xy
+        As there.
     covariance
         (n, 2, 2) of the residuals.
 
