@@ -9,6 +9,7 @@ from pipeline.ensemble import _CombinedEstimate
 from pipeline.frame import Frame
 from pipeline.geometry.pointing import corrected_attitude
 from pipeline.geometry.rotations import quaternion_from_matrix
+from pipeline.json_values import Json as Json
 from pipeline.navigate import Navigation, corrected_sigma_px
 from pipeline.options import Options
 from pipeline.predict.bodies import BodyFate
@@ -19,8 +20,6 @@ from pipeline.techniques.base import FeatureTable, TechniqueFailure, TechniqueRe
 from pipeline.techniques.landmark_table import LandmarkTable
 from pipeline.techniques.ring_edges import RingEdgeTable
 from pipeline.techniques.surface_features import SurfaceFix
-
-Json = str | int | float | bool | None | list["Json"] | dict[str, "Json"]
 
 SCHEMA = "pilotage/1"
 # Digits kept of feature positions, in decimals of a pixel; a hundredth of the best centroid's sigma.

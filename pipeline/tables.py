@@ -4,7 +4,7 @@ from collections.abc import Iterable, Mapping
 
 import pyarrow as pa
 
-from pipeline.curate import Json
+from pipeline.json_values import Json
 from pipeline.pose.records import frame_id_of
 from pipeline.pose.schemas import ARC_SCHEMA, POSE_SCHEMA, UPPER
 

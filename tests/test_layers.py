@@ -10,7 +10,7 @@ ROOT = Path(__file__).parents[1]
 PACKAGES = ("pipeline", "catalogs", "workflows")
 # Inside pipeline/, lowest first; a name stands for a module or a folder. A line is one level.
 LEVELS = (
-    ("status",),
+    ("status", "json_values"),
     ("errors", "options"),
     ("records",),
     ("camera",),
@@ -37,7 +37,7 @@ FOUNDATIONS = {
     "techniques": (
         "base", "star_fit", "star_match", "star_search", "star_inventory", "body_base", "body_search", "model_errors",
         "template_fit", "body_minor", "contour_fit", "limb_albedo", "lm", "line_search", "relief",
-        "ring_units", "ring_solve", "ring_texture", "ring_fit", "ring_search", "ring_answer",
+        "ring_units", "ring_solve", "ring_texture", "ring_bands", "ring_fit", "ring_search", "ring_answer",
         "maplet_correlation", "maplet_alignment", "landmark_table", "landmark_state",
     ),
 }  # fmt: skip

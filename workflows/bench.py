@@ -19,7 +19,7 @@ from rich.console import Console
 from rich.table import Table
 
 from catalogs.archive import open_archive
-from pipeline.curate import Json
+from pipeline.json_values import Json
 from workflows.bench_scenes import SCENES, make_scene
 from workflows.config import load_configuration
 from workflows.plan import make_plan

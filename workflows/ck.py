@@ -16,9 +16,9 @@ from catalogs.archive import Archive
 from catalogs.instruments import SpiceNames
 from catalogs.kernels import Kernel, reason_of
 from catalogs.spice import instrument_attitude, structure_of
-from pipeline.curate import Json
 from pipeline.errors import ConfigurationError, GeometryError
 from pipeline.geometry.rotations import matrix_from_quaternion, quaternion_from_matrix
+from pipeline.json_values import Json
 from pipeline.records import FloatArray
 from pipeline.status import Status
 from workflows.config import Configuration

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import cv2
 import numpy as np
 
-from pipeline.curate import Json
+from pipeline.json_values import Json
 from pipeline.records import Image
 from workflows.picture_canvas import (
     GREEN,

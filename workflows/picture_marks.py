@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.curate import Json
+from pipeline.json_values import Json
 from pipeline.records import BoolArray, FloatArray
 from workflows.picture_canvas import GREY, ORANGE, PURPLE, SKY, YELLOW, Canvas, Colour
 

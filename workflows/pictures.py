@@ -9,8 +9,8 @@ import numpy as np
 
 from catalogs.archive import SIDECAR_SUFFIX, STARS_SUFFIX, Archive
 from catalogs.images import read_image
-from pipeline.curate import Json
 from pipeline.errors import ConfigurationError, ImageError, PilotageError
+from pipeline.json_values import Json
 from pipeline.status import StatusReason
 from workflows.picture import draw_image
 from workflows.store import RunFolder, read_json, write_atomically

@@ -29,8 +29,8 @@ from catalogs.ring_catalog import RingCatalog, built_in_rings, parse_rings
 from catalogs.spice import focal_length_notes
 from catalogs.star_sources import TableProblem, read_table
 from catalogs.stars import BUILT_IN_NAMES, StarIndex, added_index, build_index, built_in_index, cache_folder, open_index
-from pipeline.curate import Json
 from pipeline.errors import ConfigurationError
+from pipeline.json_values import Json
 from pipeline.options import InstrumentSettings
 from workflows.config import Configuration
 from workflows.maplet_sources import MapletFolder, find_maplets

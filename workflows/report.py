@@ -2,8 +2,7 @@
 
 import json
 import math
-from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -15,9 +14,9 @@ from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
-from pipeline.curate import Json
 from pipeline.errors import ConfigurationError
-from workflows.store import RunFolder, read_json
+from pipeline.json_values import Json
+from workflows.store import RunFolder
 from workflows.tables_reader import open_tables
 
 _PLANTED = ["offset_dv_px", "offset_du_px", "rotation_deg"]
@@ -248,35 +247,3 @@ def _plain(value: Json) -> str:
     if isinstance(value, float):
         return f"{value:.4g}" if abs(value) < 1 else f"{value:.4f}"
     return "" if value is None else str(value)
-
-
-def progress_of(folder: RunFolder) -> tuple[int, Counter[str], bool]:
-    """State of a run, from its files alone.
-
-    Parameters
-    ----------
-    folder
-        The run, perhaps at work elsewhere.
-
-    Returns
-    -------
-    tuple
-        Images planned; those done by status; whether the run has finished.
-
-    Raises
-    ------
-    ConfigurationError
-        If the folder holds no run.
-    """
-    plan = read_json(folder.plan)
-    if plan is None or not isinstance(plan.get("images"), list):
-        raise ConfigurationError(f"{folder.root} holds no run: it has no plan.json")
-    ids: Sequence[Json] = plan["images"]  # type: ignore[assignment]
-    statuses: Counter[str] = Counter()
-    for image_id in ids:
-        document = read_json(folder.document(str(image_id)))
-        if document is not None and folder.mark(str(image_id)).exists():
-            statuses[str(document["status"])] += 1
-    summary = read_json(folder.root / "run.json")
-    finished = summary is not None and summary.get("plan_digest") == plan.get("digest")
-    return len(ids), statuses, finished

@@ -12,20 +12,15 @@ from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
 
-from pipeline.curate import Json
 from pipeline.errors import PilotageError
+from pipeline.json_values import Json
 from pipeline.status import Status
 from workflows.execute import ClusterOptions, open_workers
+from workflows.exits import EXIT_ALL_NAVIGATED, EXIT_SOME_FAILED, EXIT_SOME_IN_ERROR
 from workflows.plan import Plan, ids_of
 from workflows.run_log import logged_to, say
 from workflows.store import RunFolder, exclusive, read_json, sweep, to_json, write_atomically, write_tables
 from workflows.task import Outcome
-
-EXIT_ALL_NAVIGATED = 0
-EXIT_SOME_FAILED = 1
-EXIT_SOME_IN_ERROR = 2
-EXIT_NOT_STARTED = 3
-EXIT_INTERRUPTED = 130
 
 _LIBRARIES = ("numpy", "scipy", "numba", "opencv-python-headless", "astropy", "dask", "distributed", "pyarrow")
 

@@ -14,7 +14,7 @@ from datetime import UTC, datetime
 from enum import StrEnum
 from pathlib import Path
 
-from pipeline.curate import Json
+from pipeline.json_values import Json
 
 LOG = logging.getLogger("pilotage")
 FILE = "log.jsonl"

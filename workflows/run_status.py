@@ -2,12 +2,14 @@
 
 import fcntl
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from enum import StrEnum
 
-from workflows.report import progress_of
-from workflows.store import RunFolder
+from pipeline.errors import ConfigurationError
+from pipeline.json_values import Json
+from workflows.store import RunFolder, read_json
 
 
 class RunState(StrEnum):
@@ -110,3 +112,35 @@ def _is_locked(folder: RunFolder) -> bool:
     except (FileNotFoundError, NotADirectoryError):
         return False
     return False
+
+
+def progress_of(folder: RunFolder) -> tuple[int, Counter[str], bool]:
+    """State of a run, from its files alone.
+
+    Parameters
+    ----------
+    folder
+        The run, perhaps at work elsewhere.
+
+    Returns
+    -------
+    tuple
+        Images planned; those done by status; whether the run has finished.
+
+    Raises
+    ------
+    ConfigurationError
+        If the folder holds no run.
+    """
+    plan = read_json(folder.plan)
+    if plan is None or not isinstance(plan.get("images"), list):
+        raise ConfigurationError(f"{folder.root} holds no run: it has no plan.json")
+    ids: Sequence[Json] = plan["images"]  # type: ignore[assignment]
+    statuses: Counter[str] = Counter()
+    for image_id in ids:
+        document = read_json(folder.document(str(image_id)))
+        if document is not None and folder.mark(str(image_id)).exists():
+            statuses[str(document["status"])] += 1
+    summary = read_json(folder.root / "run.json")
+    finished = summary is not None and summary.get("plan_digest") == plan.get("digest")
+    return len(ids), statuses, finished

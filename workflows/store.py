@@ -16,8 +16,8 @@ from uuid import uuid4
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from pipeline.curate import Json
 from pipeline.errors import ConfigurationError
+from pipeline.json_values import Json
 from pipeline.tables import (
     SCHEMA_VERSION,
     SCHEMAS,

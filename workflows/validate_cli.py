@@ -7,9 +7,9 @@ from typing import Annotated
 
 import typer
 
+from workflows.exits import EXIT_ALL_NAVIGATED, EXIT_SOME_IN_ERROR
 from workflows.opening import open_both
 from workflows.plan import make_plan
-from workflows.run import EXIT_ALL_NAVIGATED, EXIT_SOME_IN_ERROR
 from workflows.store import RunFolder
 from workflows.task import ImageRunner
 

@@ -424,3 +424,14 @@ def test_command_needs_no_terminal_and_no_home(archive: Path, tmp_path: Path) ->
     assert ended.code in (0, 1), ended.err
     assert ended.out == ""
     assert "4/4" in ended.err
+
+
+@pytest.mark.parametrize("command", ["status", "query", "report"])
+def test_a_question_to_files_does_not_load_the_science(command: str) -> None:
+    program = (
+        "import sys; from workflows.cli import app\n"
+        f"app(['{command}', '--help'], standalone_mode=False)\n"
+        "print(sorted({'numba', 'cv2', 'spiceypy', 'distributed', 'scipy'} & set(sys.modules)))"
+    )
+    said = subprocess.run([sys.executable, "-c", program], cwd=ROOT, text=True, capture_output=True, check=True)
+    assert said.stdout.splitlines()[-1] == "[]"

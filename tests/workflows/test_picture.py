@@ -13,9 +13,9 @@ from tests.catalogs.planetary import pds3_label
 from tests.scenes.runs import run_archive
 from tests.support import pilotage
 from workflows.cli import app
+from workflows.exits import EXIT_SOME_IN_ERROR
 from workflows.picture import draw_image
 from workflows.pictures import chosen, draw_all
-from workflows.run import EXIT_SOME_IN_ERROR
 from workflows.samples.options import StarSampleOptions
 from workflows.samples.stars import make_star_sample
 from workflows.store import RunFolder, read_json

@@ -13,7 +13,7 @@ import pandas as pd
 import plotly.graph_objects as go
 from plotly.offline import get_plotlyjs
 
-from pipeline.curate import Json
+from pipeline.json_values import Json
 from workflows.html_report.figures import arrows, bars, histogram, scatter, trend
 from workflows.html_report.rows import FEWEST_IN_CELL, FIELD_CELLS, MOST_PULL, Change, RunRows, strangest
 from workflows.html_report.style import SCRIPT, STYLE
