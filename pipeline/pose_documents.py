@@ -11,7 +11,7 @@ from pipeline.geometry.pointing import attitude_information
 from pipeline.geometry.rotations import matrix_from_quaternion
 from pipeline.geometry.wgs84 import Datum, wgs84
 from pipeline.pose.arc_factors import AttitudeFix, DirectionFix
-from pipeline.pose.records import CameraCalibration, MatchError, MatchResult, Pose, PosePrior
+from pipeline.pose.records import CameraCalibration, MatchError, MatchResult, Pose
 from pipeline.records import CameraModel, FloatArray, Record
 
 _STARS, _LANDMARKS = "Star", "SurfaceFeatureNav"
@@ -74,7 +74,7 @@ def body_names(document: Mapping[str, Json]) -> tuple[str, ...]:
     return tuple(sorted(names, key=lambda name: name != seen))
 
 
-def documented_image(document: Mapping[str, Json], body: str, prior_covariance: FloatArray) -> DocumentedImage:
+def documented_image(document: Mapping[str, Json], body: str) -> DocumentedImage:
     """Read an image's document.
 
     Parameters
@@ -83,9 +83,6 @@ def documented_image(document: Mapping[str, Json], body: str, prior_covariance: 
         The document.
     body
         One of :func:`body_names`.
-    prior_covariance
-        (6, 6) of the believed pose, km and rad; it decides between two answers that fit alike, and does not pull.
-
     Returns
     -------
     DocumentedImage
@@ -115,12 +112,12 @@ def documented_image(document: Mapping[str, Json], body: str, prior_covariance: 
     if not isinstance(columns, dict) or not isinstance(state, dict) or state.get("body") != body:
         return image
     try:
-        return replace(image, matches=landmark_matches(image_id, columns, PosePrior(prior, prior_covariance)))
+        return replace(image, matches=landmark_matches(image_id, columns))
     except MatchError as error:
         return replace(image, trouble=str(error))
 
 
-def landmark_matches(image_id: str, columns: Mapping[str, Json], prior: PosePrior | None = None) -> MatchResult:
+def landmark_matches(image_id: str, columns: Mapping[str, Json]) -> MatchResult:
     """Matches of the landmarks that were found in an image.
 
     Parameters
@@ -130,8 +127,6 @@ def landmark_matches(image_id: str, columns: Mapping[str, Json], prior: PosePrio
     columns
         Columns of table ``landmarks``: ``observed_v_px, observed_u_px, sigma_dv_px, sigma_du_px, cov_dv_du_px2, x_km,
         y_km, z_km`` and, where the landmarks' places have errors, ``cov_xx_km2`` ... ``cov_zz_km2``.
-    prior
-        What was believed of the pose.
 
     Returns
     -------
@@ -162,7 +157,7 @@ def landmark_matches(image_id: str, columns: Mapping[str, Json], prior: PosePrio
         spread = np.zeros((len(upper), 3, 3))
         for k, (i, j) in enumerate(zip(*np.triu_indices(3), strict=True)):
             spread[:, i, j] = spread[:, j, i] = upper[:, k]
-    return MatchResult(image_id, np.flatnonzero(found), observed[found], places, covariance, spread, prior)
+    return MatchResult(image_id, np.flatnonzero(found), observed[found], places, covariance, spread)
 
 
 def _stack(columns: Mapping[str, Json], *names: str) -> FloatArray:

@@ -14,6 +14,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from catalogs.matches import MatchTable, read_image_matches
+from pipeline.camera import pixel_scale_rad
 from pipeline.curate import Json
 from pipeline.errors import ConfigurationError
 from pipeline.pose.arc_factors import ArcImage
@@ -38,6 +39,9 @@ from workflows.pose_arcs import ArcIdentity, ArcMember, SmoothedArc, fix_of, smo
 from workflows.store import RunFolder, partition_file, read_json, table_writer
 
 _STAGE = "pose"
+# What is believed of an arc that does not show it and of which nothing is told: 1 sigma of the position as a share of
+# the distance, of one attitude and of the common offset in pixels, of the common twist.
+_POSITION_SHARE, _ATTITUDE_PX, _BORESIGHT_PX, _TWIST_RAD = 0.01, 20.0, 50.0, 0.02
 # Beyond the first of images at one instant, each belongs to an arc beside: two products of one exposure.
 _Group = tuple[str, str, str, int]
 
@@ -206,6 +210,7 @@ def solve_arc(job: ArcJob) -> ArcAnswer:
     members: list[ArcMember] = []
     timings: list[dict[str, Json]] = []
     troubles: list[str] = []
+    believed: ArcOptions | None = None
     for image_id in job.image_ids:
         begun = time.monotonic()
         try:
@@ -213,6 +218,7 @@ def solve_arc(job: ArcJob) -> ArcAnswer:
         except MatchError as error:
             troubles.append(str(error))
             continue
+        believed = believed or _believed(image, job.options.arc)
         if image.trouble is not None:
             troubles.append(image.trouble)
         answer = _solved(estimator, image, job.options.budget, started)
@@ -225,9 +231,20 @@ def solve_arc(job: ArcJob) -> ArcAnswer:
             "image_id": image_id, "stage": _STAGE, "seconds": time.monotonic() - begun,
             "emitted_at_ns": time.monotonic_ns() if isinstance(answer, PoseEstimate) else None,
         })  # fmt: skip
-    options = fitted_options([member.image for member in members], job.options.arc)
+    options = fitted_options([member.image for member in members], believed or job.options.arc)
     smoothed = smooth_members(job.identity, members, options) if members else None
     return ArcAnswer(smoothed, timings, tuple(troubles))
+
+
+def _believed(image: DocumentedImage, told: ArcOptions) -> ArcOptions:
+    """Uncertainties that nobody has told, wide enough for any trajectory and pointing worth navigating."""
+    pixel = float(pixel_scale_rad(image.calibration.camera).max())
+    wide = {
+        "position_sigma_km": _POSITION_SHARE * float(np.linalg.norm(image.prior.position_km)),
+        "attitude_sigma_rad": _ATTITUDE_PX * pixel, "boresight_sigma_rad": _BORESIGHT_PX * pixel,
+        "twist_sigma_rad": _TWIST_RAD,
+    }  # fmt: skip
+    return told.model_copy(update={name: value for name, value in wide.items() if name not in told.model_fields_set})
 
 
 def _documented(job: ArcJob, image_id: str) -> DocumentedImage:
@@ -235,14 +252,16 @@ def _documented(job: ArcJob, image_id: str) -> DocumentedImage:
     document = read_json(job.folder.document(image_id))
     if document is None:
         raise MatchError(f"{image_id}: its document is gone or cannot be read")
-    prior = _prior_covariance(job.options.arc)
-    image = documented_image(document, job.identity.body, prior)
+    image = documented_image(document, job.identity.body)
+    prior = PosePrior(image.prior, _prior_covariance(_believed(image, job.options.arc)))
+    if image.matches is not None:
+        image = replace(image, matches=replace(image.matches, prior=prior))
     sidecar = None if job.options.sidecars is None else job.options.sidecars / f"{image_id}.matches.parquet"
     if sidecar is None or not sidecar.is_file():
         return image
     try:
         table = read_image_matches(sidecar.read_bytes(), str(sidecar))
-        return replace(image, matches=_matches_of(image_id, table, PosePrior(image.prior, prior)), trouble=None)
+        return replace(image, matches=_matches_of(image_id, table, prior), trouble=None)
     except (ConfigurationError, MatchError) as error:
         return replace(image, matches=None, trouble=str(error))
 

@@ -57,6 +57,18 @@ def test_landmarks_are_found_fused_and_written(tmp_path: Path) -> None:
     assert sum(row[1] for row in rows) == landmarks["diagnostics"]["landmarks_used"]
     assert all(row[2] == pytest.approx(row[3], abs=1e-4) and row[4] > 0 and row[5] > 0.3 for row in found)
     assert all(row[2] is None for row in rows if row[0] != "found")
+    table = f"read_parquet('{tmp_path}/run/poses/**/*.parquet')"
+    poses = f"select method, raw_x_km, x_km, sqrt(raw_cov_00), body from {table}"
+    ((method, x_km, smoothed, _, body),) = duckdb.sql(poses).fetchall()
+    assert (method, smoothed, body) == ("landmark_state", None, "EROS")
+    assert x_km == pytest.approx(state["position_km"][0])
+    # From the matches alone, without what was believed beforehand.
+    posed = RUN.invoke(app, ["pose", str(tmp_path / "run"), "--serial"])
+    assert posed.exit_code == 0, posed.output
+    ((method, again_km, smoothed, sigma, _),) = duckdb.sql(poses).fetchall()
+    assert method in ("sqpnp", "sqpnp_mirrored", "ransac")
+    assert abs(again_km - x_km) < 6.0 * sigma
+    assert smoothed == pytest.approx(again_km, abs=sigma)
     # A second run has nothing to do.
     again = RUN.invoke(app, ["run", str(archive), "--output", str(tmp_path / "run"), "--serial"])
     assert json.loads((tmp_path / "run" / "run.json").read_text())
