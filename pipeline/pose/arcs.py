@@ -35,6 +35,8 @@ _FIX_ROWS = 6
 # Median of the size of a normal variable.
 _MEDIAN_OF_NORMAL = 0.6745
 _ENOUGH_FIXES = 5
+_LEAST_OF_NOISE = 0.1
+_BISECTIONS = 40
 # Columns of what holds an image: its landmark fix, its offset.
 _FIX, _OFFSET = 0, 1
 # Fixes taken back settle at once or in two or three rounds.
@@ -65,7 +67,7 @@ class ArcOptions(Options):
 def fitted_options(images: Sequence[ArcImage], options: ArcOptions) -> ArcOptions:
     """Uncertainties that nobody has told, as large as an arc's own fixes show them to be.
 
-    Medians bear with fixes that are wrong. A walk comes out too large by the fixes' own errors, never too small.
+    Medians bear with fixes that are wrong.
 
     Parameters
     ----------
@@ -86,20 +88,33 @@ def fitted_options(images: Sequence[ArcImage], options: ArcOptions) -> ArcOption
     turns = np.array([
         SE3Utils.log(image.prior.camera_from_body @ fix.pose.camera_from_body.T) for image, fix in fixed
     ])  # fmt: skip
+    errors = np.array([np.diag(fix.covariance) for _, fix in fixed])
+    # Rotations of fixes are body-fixed; their mean variance holds in any axes.
+    turn_noise = np.broadcast_to(errors[:, 3:].mean(axis=1, keepdims=True), turns.shape)
     bias = np.median(turns, axis=0)
-    seconds = np.diff([image.et for image, _ in fixed])[:, None]
+    root = np.sqrt(np.diff([image.et for image, _ in fixed]))[:, None]
+    steps, step_noise = np.diff(away, axis=0) / root, (errors[1:, :3] + errors[:-1, :3]) / root**2
     found = {
-        "position_sigma_km": _spread(away), "walk_km_per_sqrt_s": _spread(np.diff(away, axis=0) / np.sqrt(seconds)),
-        "attitude_sigma_rad": _spread(turns - bias),
+        "position_sigma_km": _spread(away, errors[:, :3]), "walk_km_per_sqrt_s": _spread(steps, step_noise),
+        "attitude_sigma_rad": _spread(turns - bias, turn_noise),
         "boresight_sigma_rad": max(options.boresight_sigma_rad, float(np.abs(bias[:2]).max())),
         "twist_sigma_rad": max(options.twist_sigma_rad, abs(float(bias[2]))),
     }  # fmt: skip
-    return options.model_copy(update={k: v for k, v in found.items() if k not in options.model_fields_set and v > 0})
+    return options.model_copy(update={k: v for k, v in found.items() if k not in options.model_fields_set})
 
 
-def _spread(values: FloatArray) -> float:
-    """1 sigma of values about zero, by the median of their sizes."""
-    return float(np.median(np.abs(values))) / _MEDIAN_OF_NORMAL
+def _spread(values: FloatArray, noise2: FloatArray) -> float:
+    """1 sigma of values about zero beside the variance of their noise, by the median of their sizes.
+
+    Never less than a tenth of the noise, of which no median can tell anything.
+    """
+    low = np.log(_LEAST_OF_NOISE * np.sqrt(np.median(noise2)))
+    high = max(np.log(np.abs(values).max() + 1e-300), low) + 1.0
+    for _ in range(_BISECTIONS):
+        middle = (low + high) / 2.0
+        sizes = np.abs(values) / np.sqrt(np.exp(2.0 * middle) + noise2)
+        low, high = (middle, high) if np.median(sizes) > _MEDIAN_OF_NORMAL else (low, middle)
+    return float(np.exp(high))
 
 
 @dataclass(frozen=True, eq=False)
