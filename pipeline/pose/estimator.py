@@ -40,6 +40,8 @@ _LOG = logging.getLogger("pilotage.pose")
 _MAX_ROUNDS = 8
 # Below this many sigmas, two minima are one answer.
 _SAME_ANSWER_SIGMA = 3.0
+# A second answer as good as the first has about as many inliers; one with fewer than this share of them is none.
+_RIVAL_SHARE = 0.5
 
 
 class PoseOptions(Options):
@@ -210,10 +212,19 @@ class OpenCVGtsamPoseEstimator:
         return best
 
     def _settle_all(self, matches: _Matches, start: BoolArray, candidates: list[tuple[str, Pose]]) -> list[_Solution]:
-        return [s for name, pose in candidates if (s := self._settle(matches, start, name, pose)) is not None]
+        found: list[_Solution] = []
+        for name, pose in candidates:
+            least = _RIVAL_SHARE * max((int(s.inlier.sum()) for s in found), default=0)
+            solution = self._settle(matches, start, (name, pose), least)
+            if solution is not None:
+                found.append(solution)
+        return found
 
-    def _settle(self, matches: _Matches, start: BoolArray, method: str, pose: Pose) -> _Solution | None:
-        """Refine and choose inliers again until they stay; None where they run out."""
+    def _settle(
+        self, matches: _Matches, start: BoolArray, candidate: tuple[str, Pose], least: float
+    ) -> _Solution | None:
+        """Refine and choose inliers again until they stay; None where they run out, or are too few for a rival."""
+        method, pose = candidate
         inlier, scale = start, 1.0
         every = matches.take(np.ones(len(start), dtype=bool))
         seen: set[bytes] = set()
@@ -234,6 +245,8 @@ class OpenCVGtsamPoseEstimator:
                 return _Solution(method, fit, inlier, scale)
             if following.tobytes() == inlier.tobytes() or inlier.tobytes() in seen:
                 break
+            if seen and following.sum() < least:
+                return None
             seen.add(inlier.tobytes())
             inlier = following
         return None if fit is None else self._final(matches, method, fit, inlier, scale)
