@@ -122,6 +122,14 @@ def test_matches_of_another_program_take_the_place_of_landmarks(tmp_path: Path) 
     assert (_nees(run, poses.reset_index().iloc[:2], "raw_") < 25).all()
 
 
+def test_a_smoothed_run_can_be_asked(tmp_path: Path) -> None:
+    run = plant_run(tmp_path, count=5)
+    assert _run(run, "--serial")[0] == 0
+    question = "select label, count(*) n, any_value(images) m from poses join arcs using (arc_id) group by 1 order by 1"
+    asked = CliRunner().invoke(app, ["query", str(tmp_path), question, "--format", "csv"])
+    assert asked.output.splitlines() == ["label,n,m", "satellite_anchored,2,5", "visual_propagated,3,5"]
+
+
 def _spoil(run: PlantedRun, change: str) -> None:
     path = run.folder.document("NAC_001")
     content = json.loads(path.read_text())

@@ -39,6 +39,9 @@ def solved(flight: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[pd.D
     for name in ("poses", "arcs"):
         schema = pq.read_schema(out / f"{name}.parquet")
         assert all(set(field.metadata) == {b"unit", b"meaning"} for field in schema)
+    clocks = pd.read_parquet(out / "timings.parquet")
+    assert (clocks.seconds > 0).any()
+    assert clocks.emitted_at_ns.dropna().is_monotonic_increasing
     return pd.read_parquet(out / "poses.parquet"), pd.read_parquet(out / "arcs.parquet")
 
 
