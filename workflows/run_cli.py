@@ -99,11 +99,11 @@ def run(
         # What is wrong is said before the run.
         chosen(folder, [], pictures)
     opened, configuration = open_both(archive, config, settings)
-    work = make_plan(opened, configuration, folder, verify)
     options = ClusterOptions(0 if serial else workers, scheduler, memory_limit)
     as_json = log_format is LogFormat.JSON
     console = Console(stderr=True, quiet=as_json)
     with terminal(log_format, verbose):
+        work = make_plan(opened, configuration, folder, verify)
         with contextlib.ExitStack() as shown:
             listener = _SILENT if as_json else shown.enter_context(_follow(console, work))
             statuses = execute(work, options, listener)
