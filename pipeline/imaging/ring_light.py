@@ -18,6 +18,8 @@ _FAR_SIGMAS = 4.0
 _ROOT2, _ROOT2PI = sqrt(2.0), sqrt(2.0 * pi)
 # Residuals beyond so many sigmas are stars and struck pixels.
 _CLIP_SIGMAS, _LEAST_CLIP = 6.0, 0.7
+# Distance over which a unit's light changes by one slope.
+_SLOPE_PX = 8.0
 
 
 @numba.njit(cache=True, nogil=True)
@@ -268,134 +270,134 @@ def _eliminated(gram, pull, size, left, out_gram, out_pull):  # type: ignore[no-
 
 
 @numba.njit(cache=True, nogil=True)
+def _brightness(distance, shifts, width, step, share, columns):  # type: ignore[no-untyped-def]
+    """Level, slope and steps at a unit's pixels, per unit of each; edge k belongs to step ``step[k]`` by a share."""
+    for p in range(distance.shape[0]):
+        row = columns[p]
+        row[0] = 1.0
+        row[1] = (distance[p, 0] - shifts[0]) / _SLOPE_PX
+        for k in range(len(step)):
+            row[2 + step[k]] += share[k] * _normal_integral((distance[p, k] - shifts[k]) / width)
+
+
+@numba.njit(cache=True, nogil=True)
+def _hold(gram, left, amplitude):  # type: ignore[no-untyped-def]
+    """Complete a symmetric matrix, with weak priors on the brightness in its first rows."""
+    for a in range(gram.shape[0]):
+        for b in range(a):
+            gram[a, b] = gram[b, a]
+        if a == 1:
+            gram[a, a] += 1.0 / (0.2 * amplitude) ** 2
+        if 2 <= a < left:
+            gram[a, a] += 1.0 / (10.0 * amplitude) ** 2
+        gram[a, a] *= 1.0 + 1e-10
+
+
+@numba.njit(cache=True, nogil=True)
+def _fit_brightness(data, variance, keep, columns, amplitude, gram, pull, chosen, miss):  # type: ignore[no-untyped-def]
+    """Brightness by least squares into ``chosen``, residuals into ``miss``; chi-square and number of kept pixels."""
+    left = len(chosen)
+    gram[:, :], pull[:] = 0.0, 0.0
+    for p in range(len(data)):
+        w = keep[p] / variance[p]
+        for a in range(left):
+            pull[a] += w * columns[p, a] * data[p]
+            for b in range(a, left):
+                gram[a, b] += w * columns[p, a] * columns[p, b]
+    _hold(gram, left, amplitude)
+    if gram[0, 0] <= 0:
+        return 0.0, 0.0
+    chosen[:] = np.linalg.solve(gram, pull)
+    chi2, used = 0.0, 0.0
+    for p in range(len(data)):
+        expected = 0.0
+        for a in range(left):
+            expected += chosen[a] * columns[p, a]
+        miss[p] = data[p] - expected
+        if keep[p] > 0:
+            chi2 += miss[p] ** 2 / variance[p]
+            used += 1.0
+    return chi2, used
+
+
+@numba.njit(cache=True, nogil=True)
+def _drop(miss, variance, excess, tallest, keep):  # type: ignore[no-untyped-def]
+    """Leave out stars and struck pixels; whether there were any."""
+    # The flank of a sharp edge misses a blurred step by up to half of it and is no outlier.
+    least = (_LEAST_CLIP * tallest) ** 2
+    dropped = False
+    for p in range(len(miss)):
+        if miss[p] ** 2 > _CLIP_SIGMAS**2 * excess * variance[p] and miss[p] ** 2 > least:
+            keep[p] = 0.0
+            dropped = True
+    return dropped
+
+
+@numba.njit(cache=True, nogil=True)
+def _derivatives(distance, shifts, width, contrast, slopes):  # type: ignore[no-untyped-def]
+    """Change of a pixel's light with the shift of every edge and, behind them, with the blur's variance."""
+    count = len(contrast)
+    slopes[count] = 0.0
+    for k in range(count):
+        z = (distance[k] - shifts[k]) / width
+        steep = contrast[k] * exp(-0.5 * z * z) / (_ROOT2PI * width)
+        slopes[k] = -steep
+        slopes[count] -= steep * z / (2.0 * width)
+
+
+@numba.njit(cache=True, nogil=True)
 def unit_equations(  # type: ignore[no-untyped-def]
-    data, variance, distance, starts, edges, shifts, widening, sigma, relative, tied, amplitude, gram_out,
-    pull_out, fit_out,
+    data, variance, distance, starts, edges, shifts, width, step, share, amplitude, gram_out, pull_out, fit_out,
 ):  # fmt: skip
     """Equations of every unit in its edges' shifts (px) and the blur's variance (px^2), brightness eliminated.
 
-    Brightness of a unit: level, slope, and one contrast per edge; with ``tied`` one scale for the ``relative`` ones.
-    ``fit_out`` gets chi-square, pixels, significance of the contrasts, and the contrasts.
+    Brightness of a unit: level, slope, and steps, to which its edges belong by a share. ``fit_out`` gets chi-square,
+    pixels, significance of the steps, and the edges' contrasts.
     """
-    most = MOST_EDGES + 3
-    width = sqrt(sigma * sigma + widening)
     for n in range(edges.shape[0]):
-        low, high = starts[n], starts[n + 1]
-        count = edges[n, 1] - edges[n, 0]
-        steps = 1 if tied else count
-        left = 2 + steps
+        own = slice(starts[n], starts[n + 1])
+        pixels, count = starts[n + 1] - starts[n], edges[n, 1] - edges[n, 0]
+        left = 3 + step[n, :count].max()
         size = left + count + 1
         gram_out[n] = 0.0
         pull_out[n] = 0.0
         fit_out[n] = 0.0
-        if high - low < 2 * left + 6:
+        if pixels < 2 * left + 6:
             continue
-        columns = np.zeros((high - low, most + most + MOST_EDGES))
-        for p in range(low, high):
-            row = columns[p - low]
-            row[0] = 1.0
-            row[1] = (distance[p, 0] - shifts[n, 0]) / 8.0
-            for k in range(count):
-                z = (distance[p, k] - shifts[n, k]) / width
-                value = _normal_integral(z)
-                if tied:
-                    row[2] += relative[edges[n, 0] + k] * value
-                else:
-                    row[2 + k] = value
-        keep = np.ones(high - low)
-        chosen = np.zeros(left)
-        chi2, used = 0.0, 0.0
-        for turn in range(2):
-            gram, pull = np.zeros((left, left)), np.zeros(left)
-            for p in range(low, high):
-                w = keep[p - low] / variance[p]
-                row = columns[p - low]
-                for a in range(left):
-                    pull[a] += w * row[a] * data[p]
-                    for b in range(a, left):
-                        gram[a, b] += w * row[a] * row[b]
-            for a in range(left):
-                for b in range(a):
-                    gram[a, b] = gram[b, a]
-                if a == 1:
-                    gram[a, a] += 1.0 / (0.2 * amplitude) ** 2
-                if a >= 2:
-                    gram[a, a] += 1.0 / (10.0 * amplitude) ** 2
-                gram[a, a] *= 1.0 + 1e-10
-            if gram[0, 0] <= 0:
-                break
-            chosen[:] = np.linalg.solve(gram, pull)
-            chi2, used = 0.0, 0.0
-            for p in range(low, high):
-                expected = 0.0
-                for a in range(left):
-                    expected += chosen[a] * columns[p - low, a]
-                miss2 = (data[p] - expected) ** 2 / variance[p]
-                if keep[p - low] > 0:
-                    chi2 += miss2
-                    used += 1.0
-                columns[p - low, most] = data[p] - expected
-            if turn == 0:
-                excess = max(1.0, chi2 / max(used - left, 1.0))
-                dropped = False
-                tallest = 0.0
-                for a in range(2, left):
-                    tallest = max(tallest, abs(chosen[a]))
-                # The flank of a sharp edge misses a blurred step by up to half of it and is no outlier.
-                least = (_LEAST_CLIP * tallest) ** 2
-                for p in range(low, high):
-                    miss2 = columns[p - low, most] ** 2
-                    if miss2 > _CLIP_SIGMAS**2 * excess * variance[p] and miss2 > least:
-                        keep[p - low] = 0.0
-                        dropped = True
-                if not dropped:
-                    break
+        columns, miss, keep = np.zeros((pixels, size)), np.zeros(pixels), np.ones(pixels)
+        _brightness(distance[own], shifts[n], width, step[n, :count], share[n, :count], columns)
+        gram, pull, chosen = np.zeros((left, left)), np.zeros(left), np.zeros(left)
+        chi2, used = _fit_brightness(data[own], variance[own], keep, columns, amplitude, gram, pull, chosen, miss)
+        excess = max(1.0, chi2 / max(used - left, 1.0))
+        if used > 0.0 and _drop(miss, variance[own], excess, np.abs(chosen[2:]).max(), keep):
+            chi2, used = _fit_brightness(data[own], variance[own], keep, columns, amplitude, gram, pull, chosen, miss)
         if used < 2 * left + 4:
             continue
         # Light that the steps explain over level and slope alone.
         block, aside = np.zeros((left, left)), np.zeros(left)
         _eliminated(gram, pull, left, 2, block, aside)
-        told = 0.0
-        for a in range(steps):
-            for b in range(steps):
-                told += chosen[2 + a] * block[a, b] * chosen[2 + b]
+        for a in range(left - 2):
+            for b in range(left - 2):
+                fit_out[n, 2] += chosen[2 + a] * block[a, b] * chosen[2 + b]
+        for k in range(count):
+            fit_out[n, 3 + k] = share[n, k] * chosen[2 + step[n, k]]
         big, right = np.zeros((size, size)), np.zeros(size)
-        for p in range(low, high):
-            if keep[p - low] == 0.0:
+        for p in range(pixels):
+            if keep[p] == 0.0:
                 continue
-            w = 1.0 / variance[p]
-            row = columns[p - low]
-            slot = most + 1
-            row[slot + count] = 0.0
-            for k in range(count):
-                z = (distance[p, k] - shifts[n, k]) / width
-                c = chosen[2] * relative[edges[n, 0] + k] if tied else chosen[2 + k]
-                steep = c * exp(-0.5 * z * z) / (_ROOT2PI * width)
-                row[slot + k] = -steep
-                row[slot + count] -= steep * z / (2.0 * width)
+            w, row = 1.0 / variance[starts[n] + p], columns[p]
+            _derivatives(distance[starts[n] + p], shifts[n], width, fit_out[n, 3 : 3 + count], row[left:])
             for a in range(size):
-                x = row[a] if a < left else row[slot + a - left]
-                if x == 0.0:
+                if row[a] == 0.0:
                     continue
-                right[a] += w * x * row[most]
+                right[a] += w * row[a] * miss[p]
                 for b in range(a, size):
-                    y = row[b] if b < left else row[slot + b - left]
-                    big[a, b] += w * x * y
-        for a in range(size):
-            for b in range(a):
-                big[a, b] = big[b, a]
-            if a == 1:
-                big[a, a] += 1.0 / (0.2 * amplitude) ** 2
-            if 2 <= a < left:
-                big[a, a] += 1.0 / (10.0 * amplitude) ** 2
-            big[a, a] *= 1.0 + 1e-10
+                    big[a, b] += w * row[a] * row[b]
+        _hold(big, left, amplitude)
         # Priors on brightness have done their part in the residuals already.
-        for a in range(left):
-            right[a] = 0.0
+        right[:left] = 0.0
         _eliminated(big, right, size, left, gram_out[n], pull_out[n])
-        fit_out[n, 0], fit_out[n, 1], fit_out[n, 2] = chi2, used, told
-        for a in range(steps):
-            fit_out[n, 3 + a] = chosen[2 + a]
+        fit_out[n, 0], fit_out[n, 1] = chi2, used
 
 
 @numba.njit(cache=True, nogil=True)

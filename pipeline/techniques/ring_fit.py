@@ -18,6 +18,7 @@ from pipeline.predict.rings import RingPose, RingScene
 from pipeline.records import BoolArray, FloatArray, Image, Record
 from pipeline.techniques.base import NavContext
 from pipeline.techniques.body_base import compose
+from pipeline.techniques.ring_bands import Lattice, lattice_of, left_over
 from pipeline.techniques.ring_solve import (
     PIXEL_VARIANCE,
     Equations,
@@ -39,7 +40,7 @@ from pipeline.techniques.ring_solve import (
     unit_weights,
     without_outlier,
 )
-from pipeline.techniques.ring_texture import change_along, edge_scatter, loosened
+from pipeline.techniques.ring_texture import blended, change_along, edge_scatter, loosened
 from pipeline.techniques.ring_units import RingUnits, make_units
 
 _ROUNDS, _INNER = 6, 2
@@ -51,6 +52,8 @@ _DOUBT_FROM = 2
 # A step sharper than the pixels that sample it would stop at the nearest gap between two of them.
 _LEAST_VARIANCE_PX2, _MOST_WIDENING = PIXEL_VARIANCE + 0.05, 4.0
 _MOST_PIXELS = 400_000
+# Edges nearer to each other than so many blurs make one step.
+_ONE_STEP_BLURS = 1.5
 _FARTHEST_STEP_PX = 3.0
 # Units and pixels are chosen anew when the edges have moved so far.
 _RENEWED_PX, _SLACK_PX = 0.7, 2.0
@@ -149,6 +152,7 @@ class _Job:
     context: NavContext
     layout: Layout
     tied: bool
+    lattice: Lattice
 
     @property
     def reach_px(self) -> float:
@@ -200,7 +204,7 @@ def fit_rings(
     RingFit or str
         Or in one line why there is none.
     """
-    job = _Job(scene, frame, variance, context, layout_of(scene, context), tied)
+    job = _Job(scene, frame, variance, context, layout_of(scene, context), tied, lattice_of(frame, variance))
     now = _Round(np.asarray(start[0], float), float(start[1]), 0.0, first_radii(scene, job.layout), np.inf, None)
     units: RingUnits | None = None
     flat = np.zeros(0, np.int64)
@@ -213,6 +217,10 @@ def fit_rings(
                 return "no edge is inside the array"
         if wandered > _RENEWED_PX:
             flat, wandered = _select(job, pose), 0.0
+        if not tied:
+            # Near edges share a step in the ratio of their contrasts: better measured than predicted.
+            told = left_over(scene, job.lattice, now.offset_vu, now.rotation_rad)
+            job = replace(job, scene=replace(scene, contrasts=told.contrasts))
         pixels = _measured(job, pose, units, flat)
         after = _linearised(job, now, units, pixels, turn)
         if isinstance(after, str):
@@ -306,7 +314,8 @@ def _linearised(job: _Job, now: _Round, units: RingUnits, pixels: _Pixels, turn:
         values[layout.size] = np.clip(values[layout.size], least, _MOST_WIDENING * layout.blur2)
     equations = _equations(job, units, pixels, levers, values)
     weight = unit_weights(equations) if turn >= _DOUBT_FROM else weight
-    fit, radii = _concluded(job, units, (equations, weight, levers, values), now.radii, pivot)
+    solved = (equations, weight, levers, values)
+    fit, radii = _concluded(job, units, solved, now.radii, pivot, turn >= 1)
     full = np.zeros(3)
     full[: layout.size] = values[: layout.size]
     offset, rotation = compose(job.context, now.offset_vu, now.rotation_rad, pivot, full)
@@ -320,18 +329,39 @@ def _equations(job: _Job, units: RingUnits, pixels: _Pixels, levers: Levers, val
     count = len(units)
     gram = np.zeros((count, MOST_EDGES + 1, MOST_EDGES + 1))
     pull, fit = np.zeros((count, MOST_EDGES + 1)), np.zeros((count, 3 + MOST_EDGES))
+    step, share = _steps(units, job.scene.contrasts, _ONE_STEP_BLURS * float(np.sqrt(layout.blur2)), job.tied)
     unit_equations(
         pixels.data, pixels.variance, pixels.distance, pixels.starts, units.edges, shifts_of(levers, layout, values),
-        float(values[layout.size]), float(np.sqrt(layout.blur2)), job.scene.contrasts, job.tied, pixels.amplitude, gram,
-        pull, fit,
+        float(np.sqrt(layout.blur2 + values[layout.size])), step, share, pixels.amplitude, gram, pull, fit,
     )  # fmt: skip
-    steps = np.ones(count) if job.tied else units.present.sum(axis=1).astype(float)
-    return calibrated(gram, pull, fit, steps)
+    return blended(calibrated(gram, pull, fit, 1.0 + step.max(axis=1)), units, step)
+
+
+def _steps(
+    units: RingUnits, contrasts: FloatArray, near_px: float, tied: bool
+) -> tuple[NDArray[np.int64], FloatArray]:
+    """(n, 10) step that each edge belongs to, and its share; the light between near edges is known by their sum only.
+
+    Such edges, and with ``tied`` all of a unit, keep their predicted contrasts' ratios.
+    """
+    across = ((units.places_vu[:, 1:] - units.places_vu[:, :-1]) * units.normal_vu[:, 1:]).sum(axis=2)
+    apart = (np.abs(across) > near_px) & units.present[:, 1:] & (not tied)
+    step = np.concatenate([np.zeros((len(units), 1), np.int64), np.cumsum(apart, axis=1)], axis=1)
+    edge = np.minimum(units.edges[:, :1] + np.arange(MOST_EDGES), len(contrasts) - 1)
+    share = np.where(units.present, contrasts[edge], 0.0)
+    largest = np.zeros((len(units), MOST_EDGES))
+    rows = np.broadcast_to(np.arange(len(units))[:, None], step.shape)
+    np.maximum.at(largest, (rows, step), np.abs(share))
+    share = share / np.maximum(np.take_along_axis(largest, step, axis=1), _TINY)
+    alone = np.zeros((len(units), MOST_EDGES), np.int64)
+    np.add.at(alone, (rows, step), units.present.astype(np.int64))
+    single = np.take_along_axis(alone, step, axis=1) == 1
+    return step, np.where(single & (not tied), 1.0 * units.present, share)
 
 
 def _concluded(
     job: _Job, units: RingUnits, solved: tuple[Equations, FloatArray, Levers, FloatArray], radii: Radii,
-    pivot: FloatArray,
+    pivot: FloatArray, doubting: bool,
 ) -> tuple[RingFit, Radii]:  # fmt: skip
     """Information at the end, with what the units' and features' scatter says of their sigmas."""
     equations, weight, levers, values = solved
@@ -345,7 +375,8 @@ def _concluded(
     system = system_of(loosened(calm, units, layout, radii), weight, levers, layout, values)
     scale = _scales(levers, layout)
     radii, texture = edge_scatter(system, layout, radii)
-    radii = without_outlier(system, layout, radii, scale[0], texture)
+    if doubting:
+        radii = without_outlier(system, layout, radii, scale[0], texture)
     prior = prior_of(layout, radii, False)
     total = system.gram + np.diag(prior)
     bound = np.concatenate([1.0 / layout.bounds**2, np.zeros(len(total) - size)])

@@ -14,12 +14,12 @@ from pydantic import Field
 
 from pipeline.frame import Frame
 from pipeline.imaging.ncc import Level, make_level, ncc_around, ncc_map, peak_of
-from pipeline.imaging.ring_light import band_equations
 from pipeline.options import Options
 from pipeline.predict.rings import RingScene
-from pipeline.records import BoolArray, FloatArray, Image
+from pipeline.records import FloatArray, Image
 from pipeline.techniques.base import NavContext
 from pipeline.techniques.body_base import compose
+from pipeline.techniques.ring_bands import Lattice, LeftOver, lattice_of, left_over
 from pipeline.techniques.ring_fit import RingFit, fit_rings
 from pipeline.techniques.ring_solve import PIXEL_VARIANCE
 
@@ -28,7 +28,6 @@ _COARSE_SIDE, _COARSE_SIDE_TURNED = 256, 128
 # Light is compared after means over so many pixels of the level are taken away: what planets and skies do is wider.
 _FLATTEN = 25
 _CLIP_QUANTILE = 0.997
-_LATTICE = 16_000
 _SCAN_PX = 12
 _PLACES_ELSEWHERE = 16
 # Places nearer than this to the best one, in pixels across the edges, are the best one.
@@ -147,7 +146,7 @@ def _turned(
     bound = context.max_rotation_rad
     if not bound:
         return None
-    lattice = _lattice(frame, variance)
+    lattice = lattice_of(frame, variance)
     arm = float(np.sqrt(((fit.units.places_vu - fit.pivot_vu) ** 2).sum(axis=-1)[fit.units.present].max()))
     count = int(np.clip(np.ceil(2.0 * bound * arm / _TURN_STEP_PX), _FEWEST_ROTATIONS, _MOST_TURNS))
     turns = np.linspace(-bound, bound, count)
@@ -155,7 +154,7 @@ def _turned(
         compose(context, fit.offset_vu, fit.rotation_rad, fit.pivot_vu, np.array([0.0, 0.0, turn - fit.rotation_rad]))
         for turn in turns.tolist()
     ]
-    left = np.array([_left_over(scene, lattice, offset, rotation).mean for offset, rotation in poses])
+    left = np.array([left_over(scene, lattice, offset, rotation).mean for offset, rotation in poses])
     left[np.abs(turns - fit.rotation_rad) * arm < 2.0 * _TURN_STEP_PX] = np.inf
     offset, rotation = poses[int(np.argmin(left))]
     if not np.isfinite(left).any():
@@ -275,8 +274,8 @@ def _judged(
     scene: RingScene, frame: Frame, variance: Image, fits: list[tuple[RingFit, _Peak]], context: NavContext
 ) -> RingFix:
     """The fit that leaves least, and how much more its rivals leave."""
-    lattice = _lattice(frame, variance)
-    left = [_left_over(_corrected(scene, fit), lattice, fit.offset_vu, fit.rotation_rad) for fit, _ in fits]
+    lattice = lattice_of(frame, variance)
+    left = [left_over(_corrected(scene, fit), lattice, fit.offset_vu, fit.rotation_rad) for fit, _ in fits]
     order = np.argsort([value.mean for value in left])
     fit, peak = fits[int(order[0])]
     best = left[int(order[0])]
@@ -300,54 +299,6 @@ def _one_place(a: RingFit, b: RingFit) -> bool:
     return _mean_square_across(a, b.offset_vu - a.offset_vu) < _SAME_PX**2
 
 
-@dataclass(frozen=True, eq=False)
-class _Lattice:
-    """Single pixels of the image, far enough apart to be few."""
-
-    data: FloatArray
-    weight: FloatArray
-    step: int
-
-
-def _lattice(frame: Frame, variance: Image) -> _Lattice:
-    step = max(1, int(np.sqrt(frame.raw.size / _LATTICE)))
-    good: BoolArray = ~frame.bad[::step, ::step]
-    data = frame.raw[::step, ::step].astype(float)
-    weight = np.where(good, 1.0 / variance[::step, ::step].astype(float), 0.0)
-    level = float(np.median(data[good])) if good.any() else 0.0
-    return _Lattice(data - level, weight, step)
-
-
-@dataclass(frozen=True)
-class _LeftOver:
-    """Mean weighted square that bands of free brightness leave, that of a plane alone, and the pixels."""
-
-    mean: float
-    bare: float
-    pixels: float
-
-
-def _left_over(scene: RingScene, lattice: _Lattice, offset_vu: FloatArray, rotation_rad: float) -> _LeftOver:
-    assert scene.rays is not None
-    count = 3 + len(scene)
-    gram, pull = np.zeros((count, count)), np.zeros(count)
-    pose = scene.pose(offset_vu, rotation_rad)
-    blur = float(np.sqrt(scene.sigma_px**2 + PIXEL_VARIANCE))
-    power = band_equations(
-        scene.rays.slopes, scene.origin, pose.turn, pose.observer_km, np.zeros(2), float(lattice.step), lattice.data,
-        lattice.weight, scene.curves, scene.means, scene.spread, blur, scene.forms, scene.sun, gram, pull,
-    )  # fmt: skip
-    pixels = float((lattice.weight > 0).sum())
-    total = [float(power - _explained(gram[:n, :n], pull[:n])) for n in (3, count)]
-    floor = 1e-9 * pixels
-    return _LeftOver(max(total[1], floor) / pixels, max(total[0], floor) / pixels, pixels)
-
-
-def _explained(gram: FloatArray, pull: FloatArray) -> float:
-    ridge = 1e-9 * np.diag(np.maximum(np.diag(gram), 1e-9 * max(float(np.diag(gram).max()), 1e-300)))
-    return float(pull @ np.linalg.solve(gram + ridge, pull))
-
-
 def _corrected(scene: RingScene, fit: RingFit) -> RingScene:
     """Edges with the radii that a fit has found: an error of the catalogue must not look like a wrong place."""
     shift = fit.radius_km[scene.feature] + fit.edge_km
@@ -355,20 +306,20 @@ def _corrected(scene: RingScene, fit: RingFit) -> RingScene:
 
 
 def _scan(
-    scene: RingScene, lattice: _Lattice, fit: RingFit, best: _LeftOver, count: float
+    scene: RingScene, lattice: Lattice, fit: RingFit, best: LeftOver, count: float
 ) -> list[tuple[float, float]]:
     """Log-likelihood gaps and shifts of the dips on a walk across the edges."""
     values, vectors = np.linalg.eigh(fit.information[:2, :2])
     across = vectors[:, int(np.argmax(values))]
     shifts = np.arange(-_SCAN_PX, _SCAN_PX + 1).astype(float)
-    left = np.array([_left_over(scene, lattice, fit.offset_vu + s * across, fit.rotation_rad).mean for s in shifts])
+    left = np.array([left_over(scene, lattice, fit.offset_vu + s * across, fit.rotation_rad).mean for s in shifts])
     middle: NDArray[np.int64] = np.arange(1, len(shifts) - 1)
     dips = middle[(left[1:-1] < left[:-2]) & (left[1:-1] <= left[2:]) & (np.abs(shifts[1:-1]) > 1.0)]
     return [(0.5 * count * float(np.log(max(left[k] / best.mean, 1e-12))), float(shifts[k])) for k in dips]
 
 
 def _elsewhere(
-    scene: RingScene, lattice: _Lattice, fit: RingFit, best: _LeftOver, count: float, context: NavContext
+    scene: RingScene, lattice: Lattice, fit: RingFit, best: LeftOver, count: float, context: NavContext
 ) -> list[tuple[float, float]]:
     """Gaps and shifts of places all over the margin, across the edges: what any place explains of a textured image."""
     values, vectors = np.linalg.eigh(fit.information[:2, :2])
@@ -378,6 +329,6 @@ def _elsewhere(
     shifts = np.linspace(-reach, reach, _PLACES_ELSEWHERE) - middle
     result = []
     for shift in shifts[np.abs(shifts) > _SCAN_PX]:
-        left = _left_over(scene, lattice, fit.offset_vu + shift * across, fit.rotation_rad)
+        left = left_over(scene, lattice, fit.offset_vu + shift * across, fit.rotation_rad)
         result.append((0.5 * count * float(np.log(max(left.mean / best.mean, 1e-12))), float(shift)))
     return result

@@ -21,7 +21,7 @@ _WIDTH_SHARE = 0.3
 _OUTLIER_SIGMAS, _LEAST_OTHERS, _LEAST_TROUBLE_PX = 4.0, 2, 0.25
 # Wrong wings, widths and geometry move also edges of rings whose light does not depend on the optical depth; and a
 # predicted contrast of nearly nothing is not to be believed.
-_LEAST_UNEVEN, _MOST_UNEVEN = 0.15, 10.0
+_LEAST_UNEVEN, _MOST_UNEVEN = 0.15, 4.0
 # Sigma of single edges at the start.
 _LOOSE_PX = 0.3
 # A perfect catalogue is one whose errors no pixel shows; a free radius has this share of its prior's weight.

@@ -8,18 +8,22 @@ changes along the edge has the spectral power at long waves that independent err
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.imaging.ring_light import MOST_EDGES
+from pipeline.records import FloatArray
 from pipeline.techniques.ring_solve import Equations, Layout, Radii, System, inverse_of, own_shifts, prior_of
 from pipeline.techniques.ring_units import RingUnits
 
 # Relative unevenness of rings over the width of a blur: scale and width (natural logarithm) of the prior, and its grid.
 # Saturn's A and B rings scatter by a tenth and more from pixel to pixel in images that resolve them.
 USUAL_TEXTURE, _TEXTURE_WIDTH = 0.1, 0.7
-_TEXTURES = np.geomspace(1e-3, 3.0, 60)
+_TEXTURES = np.geomspace(1e-3, 0.4, 45)
 # Share of an edge's own sigma by which neighbouring stretches of so many pieces differ, and stretches that say as much.
 _ALONG_SHARE, _STRETCH, _ALONG_PRIOR = 0.2, 8, 8.0
 _LEAST_ALONG, _MOST_ALONG = 0.1, 100.0
+# Sigma of differences within one step.
+_APART_PX = 1.0
 
 
 def edge_scatter(system: System, layout: Layout, radii: Radii) -> tuple[Radii, float]:
@@ -68,8 +72,32 @@ def edge_scatter(system: System, layout: Layout, radii: Radii) -> tuple[Radii, f
     return replace(radii, sigma=sigma), texture
 
 
+def blended(equations: Equations, units: RingUnits, step: NDArray[np.int64]) -> Equations:
+    """Equations of units that know edges of one step by their common shift only.
+
+    How far such edges lie apart is told by the blur's variance, which is known too badly for that.
+
+    Parameters
+    ----------
+    equations, units
+        Of single edges.
+    step
+        (n, 10) step of each edge.
+
+    Returns
+    -------
+    Equations
+        Of the same units.
+    """
+    same = (step[:, :, None] == step[:, None, :]) & units.present[:, :, None] & units.present[:, None, :]
+    among = np.maximum(same.sum(axis=2), 1)
+    variance = np.zeros(equations.gram.shape)
+    variance[:, :MOST_EDGES, :MOST_EDGES] = _APART_PX**2 * (np.eye(MOST_EDGES) * same - same / among[:, :, None])
+    return _with_errors(equations, variance)
+
+
 def loosened(equations: Equations, units: RingUnits, layout: Layout, radii: Radii) -> Equations:
-    """Equations of units whose edges' shifts err one by one: G becomes (1 + G S)^-1 G with S the errors' variances.
+    """Equations of units whose edges' shifts err one by one.
 
     Parameters
     ----------
@@ -84,12 +112,19 @@ def loosened(equations: Equations, units: RingUnits, layout: Layout, radii: Radi
         Of the same units.
     """
     edge = np.minimum(units.edges[:, :1] + np.arange(MOST_EDGES), len(layout.column) - 1)
-    variance = np.zeros(equations.pull.shape)
-    variance[:, :MOST_EDGES] = radii.along * radii.sigma[layout.features + edge] ** 2 * units.present
-    matrix = np.eye(MOST_EDGES + 1) + equations.gram * variance[:, None, :]
+    variance = np.zeros(equations.gram.shape)
+    own = np.arange(MOST_EDGES)
+    variance[:, own, own] = radii.along * radii.sigma[layout.features + edge] ** 2 * units.present
+    return _with_errors(equations, variance)
+
+
+def _with_errors(equations: Equations, variance: FloatArray) -> Equations:
+    """G becomes (1 + G S)^-1 G where the shifts have errors of covariance S, (n, 11, 11)."""
+    matrix = np.eye(MOST_EDGES + 1) + equations.gram @ variance
     both = np.concatenate([equations.gram, equations.pull[:, :, None]], axis=2)
     solved = np.linalg.solve(matrix, both)
-    return replace(equations, gram=solved[:, :, :-1], pull=solved[:, :, -1])
+    gram = solved[:, :, :-1]
+    return replace(equations, gram=(gram + gram.transpose(0, 2, 1)) / 2.0, pull=solved[:, :, -1])
 
 
 def change_along(equations: Equations, units: RingUnits, layout: Layout, radii: Radii) -> Radii:
