@@ -159,6 +159,11 @@ class _Job:
         """Distance from an edge up to which pixels are used."""
         return 3.0 * float(np.sqrt(self.layout.blur2)) + 1.5
 
+    @property
+    def near_px(self) -> float:
+        """Distance below which edges share a step."""
+        return _ONE_STEP_BLURS * float(np.sqrt(self.layout.blur2))
+
 
 def smoothed_variance(frame: Frame) -> Image:
     """Variance of each pixel by its neighbourhood's level, which its own noise hardly moves.
@@ -217,7 +222,7 @@ def fit_rings(
                 return "no edge is inside the array"
         if wandered > _RENEWED_PX:
             flat, wandered = _select(job, pose), 0.0
-        if not tied:
+        if not tied and (units.present[:, 1:] & ~_apart(units, job.near_px)).any():
             # Near edges share a step in the ratio of their contrasts: better measured than predicted.
             told = left_over(scene, job.lattice, now.offset_vu, now.rotation_rad)
             job = replace(job, scene=replace(scene, contrasts=told.contrasts))
@@ -329,12 +334,18 @@ def _equations(job: _Job, units: RingUnits, pixels: _Pixels, levers: Levers, val
     count = len(units)
     gram = np.zeros((count, MOST_EDGES + 1, MOST_EDGES + 1))
     pull, fit = np.zeros((count, MOST_EDGES + 1)), np.zeros((count, 3 + MOST_EDGES))
-    step, share = _steps(units, job.scene.contrasts, _ONE_STEP_BLURS * float(np.sqrt(layout.blur2)), job.tied)
+    step, share = _steps(units, job.scene.contrasts, job.near_px, job.tied)
     unit_equations(
         pixels.data, pixels.variance, pixels.distance, pixels.starts, units.edges, shifts_of(levers, layout, values),
         float(np.sqrt(layout.blur2 + values[layout.size])), step, share, pixels.amplitude, gram, pull, fit,
     )  # fmt: skip
     return blended(calibrated(gram, pull, fit, 1.0 + step.max(axis=1)), units, step)
+
+
+def _apart(units: RingUnits, near_px: float) -> BoolArray:
+    """(n, 9) whether each edge but the first is far enough from the one before it."""
+    across = ((units.places_vu[:, 1:] - units.places_vu[:, :-1]) * units.normal_vu[:, 1:]).sum(axis=2)
+    return np.asarray(np.abs(across) > near_px)
 
 
 def _steps(
@@ -344,8 +355,7 @@ def _steps(
 
     Such edges, and with ``tied`` all of a unit, keep their predicted contrasts' ratios.
     """
-    across = ((units.places_vu[:, 1:] - units.places_vu[:, :-1]) * units.normal_vu[:, 1:]).sum(axis=2)
-    apart = (np.abs(across) > near_px) & units.present[:, 1:] & (not tied)
+    apart = _apart(units, near_px) & units.present[:, 1:] & (not tied)
     step = np.concatenate([np.zeros((len(units), 1), np.int64), np.cumsum(apart, axis=1)], axis=1)
     edge = np.minimum(units.edges[:, :1] + np.arange(MOST_EDGES), len(contrasts) - 1)
     share = np.where(units.present, contrasts[edge], 0.0)
