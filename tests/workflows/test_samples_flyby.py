@@ -225,6 +225,7 @@ def test_cameras_are_the_configured_ones(shots: list[Shot]) -> None:
     instruments = load_configuration().instruments
     names = {
         "cassini_nac": ("coiss_nac", "1024"), "cassini_nac_sum2": ("coiss_nac", "512"),
+        "cassini_wac": ("coiss_wac", "1024"), "cassini_wac_sum2": ("coiss_wac", "512"),
         "voyager_na": ("vgiss_2_na", "GEOMED"), "lorri_1x1": ("nhlorri", "1X1"), "lorri_4x4": ("nhlorri", "4X4"),
     }  # fmt: skip
     assert set(names) == set(flyby_cameras())
