@@ -99,3 +99,19 @@ def test_relief_gives_sigmas_that_hold() -> None:
         sigma = np.sqrt(np.diag(np.linalg.inv(fit.information)))
         pulls.append((fit.step - [0.4, -0.3]) / sigma)
     assert 0.75 < np.sqrt(np.mean(np.square(pulls))) < 1.25
+
+
+def test_a_function_of_distance_that_is_no_covariance_ends_no_fit() -> None:
+    angle = np.linspace(0.0, np.pi, 60)
+    normal = np.stack([np.sin(angle), np.cos(angle)], axis=1)
+    direction = np.column_stack([np.cos(angle), np.sin(angle), 0.0 * angle])
+    # Even up to 40 px and then gone: its matrix has negative eigenvalues beyond the noise.
+    lags, texture = np.array([0.0, 40.0, 40.1]), np.array([1.0, 1.0, 0.0])
+    shift = normal @ np.array([0.4, -0.3])
+    segments = Segments(
+        50.0 * normal, normal, direction, np.zeros(60, np.int64), shift, np.full(60, 0.01), np.full(60, 20.0),
+        np.ones(60, bool), lags, texture,
+    )  # fmt: skip
+    fit = fit_relief(segments, None, {0: Field_(0.02, 6.0, True, 0.02)}, ReliefOptions())
+    assert np.allclose(fit.step, [0.4, -0.3], atol=0.05)
+    assert (np.linalg.eigvalsh(fit.information) > 0).all()
