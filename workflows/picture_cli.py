@@ -5,9 +5,10 @@ from typing import Annotated
 
 import typer
 
-from catalogs.archive import Archive, open_archive
+from catalogs.archive import open_archive
 from pipeline.errors import ConfigurationError
-from workflows.store import RunFolder, document_of, read_json, write_atomically
+from workflows.opening import open_remembered
+from workflows.store import RunFolder, document_of, write_atomically
 
 
 def picture(
@@ -28,7 +29,7 @@ def picture(
     if archive is None and len(images) > 1 and not folder.document(images[0]).exists():
         archive, images = images[0], images[1:]
     documents = [document_of(folder, image) for image in images]
-    opened = _archive(folder, archive)
+    opened = open_remembered(folder, "--archive ARCHIVE") if archive is None else open_archive(archive, {})
     if output is None:
         for path in draw_all(opened, folder, images):
             typer.echo(f"{path}")
@@ -37,14 +38,3 @@ def picture(
         raise ConfigurationError("--output is for one image")
     write_atomically(output, draw(opened, folder, documents[0]))
     typer.echo(f"{output}")
-
-
-def _archive(folder: RunFolder, url: str | None) -> Archive:
-    """The archive that is named, or the one that the run remembers."""
-    if url is not None:
-        return open_archive(url, {})
-    summary = read_json(folder.root / "run.json") or {}
-    remembered, description = summary.get("archive_url"), summary.get("archive_description")
-    if not isinstance(remembered, str) or not isinstance(description, dict):
-        raise ConfigurationError(f"{folder.root} does not say where its archive is: add --archive ARCHIVE")
-    return open_archive(remembered, {"images": description["images"]})

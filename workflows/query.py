@@ -15,6 +15,9 @@ from pipeline.errors import ConfigurationError
 from workflows.store import RunFolder
 from workflows.tables_reader import open_tables
 
+# DuckDB has none, and the length of an offset is the most natural question.
+_HYPOT = "CREATE MACRO hypot(a, b) AS sqrt(a * a + b * b)"
+
 
 @contextmanager
 def _database(folder: RunFolder) -> Iterator[tuple[duckdb.DuckDBPyConnection, dict[str, list[str]]]]:
@@ -24,6 +27,7 @@ def _database(folder: RunFolder) -> Iterator[tuple[duckdb.DuckDBPyConnection, di
     with duckdb.connect(":memory:", config={"threads": 1}) as database:
         for name, table in tables.items():
             database.register(name, table)
+        database.execute(_HYPOT)
         database.execute("SET python_enable_replacements = false")
         database.execute("SET enable_external_access = false")
         database.execute("SET lock_configuration = true")

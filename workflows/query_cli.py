@@ -59,14 +59,23 @@ def _written(answer: pa.Table, form: Format) -> bytes:
     return writers[form](answer) if form in writers else _drawn(answer).encode()
 
 
+def _shown(value: object) -> str:
+    """A value in a table: the other forms hold all digits."""
+    if isinstance(value, float):
+        text = f"{value:.7g}"
+        # Large ones are times, of which milliseconds count.
+        return f"{value:.3f}" if "e+" in text else text
+    return "" if value is None else str(value)
+
+
 def _drawn(answer: pa.Table) -> str:
-    """Columns for a person: every value whole, null empty."""
+    """Columns for a person: numbers to seven digits, null empty."""
     table = Table(box=None, pad_edge=False)
     for field in answer.schema:
         right = pa.types.is_integer(field.type) or pa.types.is_floating(field.type)
         table.add_column(Text(field.name), justify="right" if right else "left", no_wrap=True)
     for row in zip(*(column.to_pylist() for column in answer.columns), strict=True):
-        table.add_row(*(Text("" if value is None else str(value)) for value in row))
+        table.add_row(*(Text(_shown(value)) for value in row))
     console = Console(width=_WIDE, color_system=None, highlight=False)
     with console.capture() as captured:
         console.print(table)

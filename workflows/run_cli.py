@@ -9,13 +9,13 @@ from typing import Annotated
 
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
 from pipeline.errors import ConfigurationError
 from workflows.ck import FOLDER, write_c_kernels
 from workflows.execute import ClusterOptions
 from workflows.notify import notify
-from workflows.opening import open_both
+from workflows.opening import open_both, open_remembered, remembered_configuration
 from workflows.plan import Plan, ids_of, make_plan
 from workflows.report import (
     compare,
@@ -124,16 +124,23 @@ def run(
 def _follow(console: Console, work: Plan):  # type: ignore[no-untyped-def]
     """Progress bar on a terminal, plain lines in a log."""
     counts: Counter[str] = Counter()
-    total, started = len(work.todo), time.monotonic()
+    total = len(work.todo)
+    times: list[float] = []
 
     def count(outcome: Outcome) -> None:
         counts[outcome.status] += 1
+        times[1:] = [time.monotonic()]
 
     def line() -> str:
-        done = sum(counts.values())
-        rate = done / max(time.monotonic() - started, 1e-9)
-        parts = " ".join(f"{status}:{count}" for status, count in sorted(counts.items()))
-        return f"{rate:.1f} images/s  {parts}"
+        return " ".join(f"{status}:{count}" for status, count in sorted(counts.items()))
+
+    def speed() -> str:
+        # Workers load and compile before their first answer, which tells nothing of the others.
+        done, taken = sum(counts.values()), times[-1] - times[0]
+        if done < 2 or taken <= 0:
+            return ""
+        rate = (done - 1) / taken
+        return f"  {rate:.2g} images/s, {(total - done) / rate:.0f} s left"
 
     answered = len(work.every) - total
 
@@ -145,7 +152,6 @@ def _follow(console: Console, work: Plan):  # type: ignore[no-untyped-def]
             TextColumn("navigating"),
             BarColumn(),
             MofNCompleteColumn(),
-            TimeRemainingColumn(),
             TextColumn("{task.description}"),
         )
         with Progress(*columns, console=console) as progress:
@@ -153,7 +159,7 @@ def _follow(console: Console, work: Plan):  # type: ignore[no-untyped-def]
 
             def on_done(outcome: Outcome) -> None:
                 count(outcome)
-                progress.update(task, advance=1, description=line())
+                progress.update(task, advance=1, description=line() + speed())
 
             yield RunListener(lambda text: progress.console.print(text, highlight=False), on_done, start)
         return
@@ -165,8 +171,7 @@ def _follow(console: Console, work: Plan):  # type: ignore[no-untyped-def]
         done = sum(counts.values())
         if time.monotonic() - last > _LOG_EVERY_S or done == total:
             last = time.monotonic()
-            left = (total - done) * (last - started) / done
-            console.print(f"{done}/{total}  {line()}  {left:.0f} s left", highlight=False, soft_wrap=True)
+            console.print(f"{done}/{total}  {line()}{speed()}", highlight=False, soft_wrap=True)
 
     yield RunListener(lambda text: console.print(text, highlight=False, soft_wrap=True), log_done, start)
 
@@ -196,12 +201,20 @@ def _console() -> Console:
 
 def ck(
     run_folder: RunArg,
-    archive: ArchiveArg,
+    archive: Annotated[
+        str | None, typer.Argument(help="Folder or URL of the archive; by default where the run found it.")
+    ] = None,
     output: Annotated[Path | None, typer.Option("--output", "-o", help="Folder to write; RUN/ck by default.")] = None,
     config: ConfigOption = [],  # noqa: B006
     settings: SetOption = [],  # noqa: B006
 ) -> None:
     """Write corrected pointing as SPICE C-kernels, and a meta-kernel that loads them after the archive's own."""
     folder = RunFolder(run_folder)
-    for path in write_c_kernels(folder, *open_both(archive, config, settings), output or run_folder / FOLDER):
+    if archive is not None:
+        opened, configuration = open_both(archive, config, settings)
+    elif config or settings:
+        raise ConfigurationError("ck: --config and --set need ARCHIVE beside; without it all is as the run had it")
+    else:
+        opened, configuration = open_remembered(folder, "ARCHIVE"), remembered_configuration(folder, "ARCHIVE")
+    for path in write_c_kernels(folder, opened, configuration, output or run_folder / FOLDER):
         typer.echo(f"{path}")

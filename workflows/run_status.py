@@ -35,7 +35,7 @@ class RunStatus:
     answered_now
         Images answered since the latest start.
     seconds
-        From that start to the latest answer.
+        From the first of these answers to the latest.
     last_outcome
         When the latest answer came; None if none has come since the start.
     """
@@ -54,8 +54,8 @@ class RunStatus:
 
     @property
     def rate_per_s(self) -> float | None:
-        """Images per second since the latest start; None before the first."""
-        return self.answered_now / self.seconds if self.answered_now and self.seconds > 0 else None
+        """Images per second since the first answer, which had to wait for workers; None before the second."""
+        return (self.answered_now - 1) / self.seconds if self.answered_now > 1 and self.seconds > 0 else None
 
     def line(self) -> str:
         """One line for a person."""
@@ -66,7 +66,7 @@ class RunStatus:
         parts.append("finished" if self.state is RunState.FINISHED else f"not finished: {self.state}")
         rate = self.rate_per_s
         if self.state is RunState.RUNNING and rate is not None:
-            parts.append(f"{rate:.1f} images/s, {self.left / rate:.0f} s left")
+            parts.append(f"{rate:.2g} images/s, {self.left / rate:.0f} s left")
         if self.state is RunState.STOPPED:
             parts.append("run the same command again to go on")
         return "; ".join(parts)
@@ -97,9 +97,9 @@ def status_of_run(folder: RunFolder) -> RunStatus:
     started = folder.plan.stat().st_mtime
     times = [entry.stat().st_mtime for entry in folder.state.glob("[!.]*.json")]
     now = [time for time in times if time >= started]
-    last = max(now, default=started)
+    first, last = min(now, default=started), max(now, default=started)
     outcome = datetime.fromtimestamp(last, UTC) if now else None
-    return RunStatus(state, planned, statuses, len(now), last - started, outcome)
+    return RunStatus(state, planned, statuses, len(now), last - first, outcome)
 
 
 def _is_locked(folder: RunFolder) -> bool:

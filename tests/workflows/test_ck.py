@@ -214,6 +214,22 @@ def test_the_same_run_gives_the_same_bytes(archive: Path, run: Path, corrected: 
     spiceypy.kclear()
 
 
+def test_a_run_remembers_archive_and_configuration(
+    archive: Path, run: Path, corrected: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert pilotage("ck", run, "--output", tmp_path / "remembered").code == 0
+    written = sorted(path.name for path in corrected.parent.glob("*.bc"))
+    assert sorted(path.name for path in (tmp_path / "remembered").glob("*.bc")) == written
+    for name in written:
+        assert (tmp_path / "remembered" / name).read_bytes() == (corrected.parent / name).read_bytes()
+    assert "need ARCHIVE" in pilotage("ck", run, "--set", "detection.threshold_sigma=6").refusal()
+    killed = Path(shutil.copytree(run, tmp_path / "killed"))
+    (killed / "run.json").unlink()
+    assert "has not ended yet" in pilotage("ck", killed).refusal()
+    assert "holds no run" in pilotage("ck", tmp_path).refusal()
+
+
 def test_what_cannot_be_written_is_said_in_one_line(archive: Path, run: Path, tmp_path: Path) -> None:
     assert "holds no run" in pilotage("ck", tmp_path, archive).refusal()
     copy = Path(shutil.copytree(archive, tmp_path / "archive", ignore=shutil.ignore_patterns("data")))

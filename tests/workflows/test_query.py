@@ -49,6 +49,14 @@ def test_answer_holds_partitions_and_nulls(run: Path) -> None:
     assert all(row["offset_dv_px"] is None for row in rows)
 
 
+def test_hypot_is_known_and_tables_are_for_eyes(run: Path) -> None:
+    assert pilotage("query", run, "SELECT hypot(3, 4) AS length").out.split() == ["length", "5"]
+    drawn = pilotage("query", run, "SELECT 2.0 / 3 AS third, 548312300.0891376::DOUBLE AS et").out
+    assert drawn.split() == ["third", "et", "0.6666667", "548312300.089"]
+    said = json.loads(pilotage("query", run, "SELECT 2.0 / 3 AS third", "--format", "json").out)
+    assert said == [{"third": 2.0 / 3}]
+
+
 def test_formats_say_the_same(run: Path, tmp_path: Path) -> None:
     said = json.loads(pilotage("query", run, QUESTION, "--format", "json").out)
     assert said == ask(RunFolder(run), QUESTION).to_pylist()

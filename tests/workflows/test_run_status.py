@@ -79,8 +79,8 @@ def test_looking_does_not_keep_a_run_from_starting(tmp_path: Path) -> None:
 
 def test_line_counts_what_is_left_by_the_rate() -> None:
     when = datetime(2024, 1, 2, 3, 4, 5, tzinfo=UTC)
-    line = RunStatus(RunState.RUNNING, 100, Counter(success=30, failed=10), 20, 10.0, when).line()
+    line = RunStatus(RunState.RUNNING, 100, Counter(success=30, failed=10), 21, 10.0, when).line()
     assert line == (
         "40 of 100 images done (10 failed, 30 success); last outcome 2024-01-02T03:04:05+00:00; "
-        "not finished: running; 2.0 images/s, 30 s left"
+        "not finished: running; 2 images/s, 30 s left"
     )
