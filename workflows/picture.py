@@ -1,6 +1,6 @@
 """Summary picture of one navigated image: what was predicted, what was found, and the answer in words."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import cv2
 import numpy as np
@@ -24,7 +24,7 @@ from workflows.picture_canvas import (
     text_width,
     wrapped,
 )
-from workflows.picture_marks import Key, draw_marks
+from workflows.picture_marks import Key, RingLine, draw_marks
 
 # Small images are enlarged to about the first, large ones shrunk below the second; text needs the third.
 _LEAST_SIDE, _MOST_SIDE, _LEAST_WIDTH = 640, 1400, 720
@@ -36,7 +36,7 @@ _COLOUR_OF_RANK: dict[str, Colour] = {
 }  # fmt: skip
 
 
-def draw_image(pixels: Image, document: Mapping[str, Json]) -> bytes:
+def draw_image(pixels: Image, document: Mapping[str, Json], expected_rings: Sequence[RingLine] = ()) -> bytes:
     """Draw an image with what was predicted, found and rejected.
 
     Parameters
@@ -45,6 +45,8 @@ def draw_image(pixels: Image, document: Mapping[str, Json]) -> bytes:
         (rows, cols) as read.
     document
         The image's JSON document.
+    expected_rings
+        Edges as predicted, for an image whose document holds none that were found.
 
     Returns
     -------
@@ -63,7 +65,7 @@ def draw_image(pixels: Image, document: Mapping[str, Json]) -> bytes:
     picture[top : top + rows, left : left + columns] = image
     # Marks end at the image's border.
     inside = Canvas(picture[top : top + rows, left : left + columns], (0, 0), scale)
-    keys = draw_marks(inside, document, (pixels.shape[0], pixels.shape[1]))
+    keys = draw_marks(inside, document, (pixels.shape[0], pixels.shape[1]), expected_rings)
     canvas = Canvas(picture, (left, top), scale)
     cv2.rectangle(picture, (left - 1, top - 1), (left + columns, top + rows), GREY, 1)
     _write_head(canvas, head)

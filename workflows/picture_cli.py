@@ -23,7 +23,7 @@ def picture(
 ) -> None:
     """Draw images with what was predicted, used and refused."""
     # Drawing libraries take half a second to load, which no other command should pay.
-    from workflows.pictures import draw, draw_all
+    from workflows.pictures import RingSource, draw, draw_all
 
     folder = RunFolder(run_folder)
     if archive is None and len(images) > 1 and not folder.document(images[0]).exists():
@@ -36,5 +36,5 @@ def picture(
         return
     if len(images) > 1:
         raise ConfigurationError("--output is for one image")
-    write_atomically(output, draw(opened, folder, documents[0]))
+    write_atomically(output, draw(opened, folder, documents[0], RingSource(opened)))
     typer.echo(f"{output}")

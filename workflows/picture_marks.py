@@ -21,6 +21,8 @@ _COUNTED = 0.05
 _PLACED_PX = 1.0
 _VECTOR_PX = 22.0
 _BOX = 9.0
+RingLine = tuple[str, FloatArray]
+"""Name of a ring feature and (n, 2) pixels along one of its edges, NaN where it breaks off."""
 # A short line in the key.
 _BAR = np.array([[-8.0, 0.0], [8.0, 0.0]])
 
@@ -59,7 +61,9 @@ class Features:
         return np.asarray(~self.used & np.isfinite(self.measured_vu).all(axis=1))
 
 
-def draw_marks(canvas: Canvas, document: Mapping[str, Json], shape: tuple[int, int]) -> list[Key]:
+def draw_marks(
+    canvas: Canvas, document: Mapping[str, Json], shape: tuple[int, int], expected_rings: Sequence[RingLine] = ()
+) -> list[Key]:
     """Draw all that is known of an image's features.
 
     Parameters
@@ -70,6 +74,8 @@ def draw_marks(canvas: Canvas, document: Mapping[str, Json], shape: tuple[int, i
         The image's JSON document.
     shape
         Rows and columns of the image.
+    expected_rings
+        Drawn where no ring edge was found.
 
     Returns
     -------
@@ -81,7 +87,7 @@ def draw_marks(canvas: Canvas, document: Mapping[str, Json], shape: tuple[int, i
     for kind, colour in (("limb", ORANGE), ("terminator", YELLOW)):
         for table in _tables(document, (kind,))[:1]:
             keys += _line(canvas, table, kind, colour)
-    keys += _rings(canvas, document, shape)
+    keys += _rings(canvas, document, shape) or _expected_rings(canvas, expected_rings)
     for table in _tables(document, ("star",))[:1]:
         keys += _stars(canvas, table)
     return keys + _landmarks(canvas, document)
@@ -202,14 +208,27 @@ def _rings(canvas: Canvas, document: Mapping[str, Json], shape: tuple[int, int])
         labelled.append((pieces, name.rpartition(" ")[0]))
     used, refused = placed & counted, placed & ~counted
     _dots(canvas, canvas.places(found[used]), canvas.places(found[refused]), ORANGE)
-    _ring_names(canvas, [(canvas.places(found[pieces]), name) for pieces, name in labelled])
+    _ring_names(canvas, [(canvas.places(found[pieces]), name) for pieces, name in labelled], ORANGE)
     keys = [Key(_piece_of_line, "ring edge before correction")]
     faint = f", {int((~placed).sum())} too faint to show" if not placed.all() else ""
     keys.append(Key(lambda c, p: c.circles(p, 2.5, ORANGE, -1), f"ring edge found ({int(used.sum())}{faint})"))
     return keys + _refused(int(refused.sum()))
 
 
-def _ring_names(canvas: Canvas, edges: list[tuple[FloatArray, str]]) -> None:
+def _expected_rings(canvas: Canvas, lines: Sequence[RingLine]) -> list[Key]:
+    """Thin lines where edges were expected."""
+    for _, vu in lines:
+        whole, places = np.flatnonzero(np.isfinite(vu).all(axis=1)), canvas.places(vu)
+        for run in np.split(whole, np.flatnonzero(np.diff(whole) > 1) + 1):
+            if len(run) > 1:
+                canvas.line(places[run], SKY)
+    limits = np.array(canvas.pixels.shape[:2]) / canvas.scale
+    inside = [(vu[((vu >= 0) & (vu < limits)).all(axis=1)], name) for name, vu in lines]
+    _ring_names(canvas, [(canvas.places(vu), name) for vu, name in inside if len(vu)], SKY)
+    return [Key(_piece_of_line, f"ring edge predicted ({len(lines)})")] if lines else []
+
+
+def _ring_names(canvas: Canvas, edges: list[tuple[FloatArray, str]], colour: Colour) -> None:
     """Each feature's name once, where no other name stands."""
     taken: list[tuple[float, float]] = []
     named: set[str] = set()
@@ -218,7 +237,7 @@ def _ring_names(canvas: Canvas, edges: list[tuple[FloatArray, str]]) -> None:
             continue
         for x, y in places[:: max(len(places) // 6, 1)]:
             if all(abs(x - a) > 110 or abs(y - b) > 15 for a, b in taken):
-                canvas.text(x + 6, y - 4, name, _NAME_SIZE, ORANGE, shade=True)
+                canvas.text(x + 6, y - 4, name, _NAME_SIZE, colour, shade=True)
                 taken.append((x, y))
                 named.add(name)
                 break

@@ -2,6 +2,7 @@
 
 import logging
 from collections.abc import Sequence
+from functools import cached_property
 from pathlib import Path
 from posixpath import basename, dirname
 
@@ -9,10 +10,14 @@ import numpy as np
 
 from catalogs.archive import SIDECAR_SUFFIX, STARS_SUFFIX, Archive
 from catalogs.images import read_image
+from catalogs.ring_catalog import RingCatalog
 from pipeline.errors import ConfigurationError, ImageError, PilotageError
 from pipeline.json_values import Json
 from pipeline.status import StatusReason
 from workflows.picture import draw_image
+from workflows.picture_marks import RingLine
+from workflows.picture_rings import expected_edges
+from workflows.plan import open_rings
 from workflows.store import RunFolder, read_json, write_atomically
 
 _LOG = logging.getLogger("pilotage")
@@ -54,7 +59,35 @@ def chosen(folder: RunFolder, image_ids: Sequence[str], which: str) -> list[str]
     raise ConfigurationError(f"pictures: {which!r} is none of all, failed, sample:N, none")
 
 
-def draw(archive: Archive, folder: RunFolder, document: dict[str, Json]) -> bytes:
+class RingSource:
+    """Ring catalogues of an archive, read when a picture first needs them.
+
+    Parameters
+    ----------
+    archive
+        The archive.
+    """
+
+    def __init__(self, archive: Archive) -> None:
+        self._archive = archive
+
+    @cached_property
+    def _catalogs(self) -> tuple[RingCatalog, ...]:
+        try:
+            return open_rings(self._archive)
+        except ConfigurationError as error:
+            # The picture is worth having without them.
+            _LOG.warning("pictures show no predicted rings: %s", error)
+            return ()
+
+    def expected(self, document: dict[str, Json]) -> list[RingLine]:
+        """Edges as predicted, where the document holds none that were found."""
+        if document["ring_edges"] is not None or not document["rings"]:
+            return []
+        return expected_edges(document, self._catalogs)
+
+
+def draw(archive: Archive, folder: RunFolder, document: dict[str, Json], rings: RingSource) -> bytes:
     """Picture of one image.
 
     Parameters
@@ -65,6 +98,8 @@ def draw(archive: Archive, folder: RunFolder, document: dict[str, Json]) -> byte
         The run, whose marks tell which files belong to the image.
     document
         Of the image.
+    rings
+        Of the same archive.
 
     Returns
     -------
@@ -83,7 +118,7 @@ def draw(archive: Archive, folder: RunFolder, document: dict[str, Json]) -> byte
     except OSError as error:
         detail = f"{path}: {error.strerror or type(error).__name__}"
         raise ImageError(StatusReason.IMAGE_UNREADABLE, detail) from error
-    return draw_image(read_image(data, path, beside).pixels, document)
+    return draw_image(read_image(data, path, beside).pixels, document, rings.expected(document))
 
 
 def _beside(folder: RunFolder, image_id: str, path: str) -> list[str]:
@@ -117,7 +152,7 @@ def draw_all(archive: Archive, folder: RunFolder, image_ids: Sequence[str]) -> l
     """
     place = folder.root / "pictures"
     place.mkdir(exist_ok=True)
-    drawn = []
+    drawn, rings = [], RingSource(archive)
     for image_id in image_ids:
         target, source = place / f"{image_id}.png", folder.document(image_id)
         if not (target.exists() and target.stat().st_mtime_ns >= source.stat().st_mtime_ns):
@@ -125,7 +160,7 @@ def draw_all(archive: Archive, folder: RunFolder, image_ids: Sequence[str]) -> l
             if document is None:
                 continue
             try:
-                write_atomically(target, draw(archive, folder, document))
+                write_atomically(target, draw(archive, folder, document, rings))
             except PilotageError as error:
                 _LOG.warning("no picture of %s: %s", image_id, error)
                 continue
