@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Literal
 from urllib.parse import unquote
 
+import cv2
 import numpy as np
 import pandas as pd
 import pyarrow as pa
@@ -192,6 +193,37 @@ def test_the_keyboard_reaches_images_and_every_figure_has_words(small_run: Path,
     page.keyboard.press("Escape")
     for figure in page.locator("figure").all():
         assert figure.get_attribute("aria-label") == figure.locator("figcaption").inner_text()
+
+
+@needs_chromium
+def test_the_strangest_show_their_pictures_and_open_them(small_run: Path, page: Page, tmp_path: Path) -> None:
+    run = Path(shutil.copytree(small_run, tmp_path / "run"))
+    (run / "pictures").mkdir(exist_ok=True)
+    for path in (run / "images").glob("*.json"):
+        cv2.imwrite(str(run / "pictures" / f"{path.stem}.png"), np.full((40, 60, 3), 90, np.uint8))
+    assert _open(page, _report(run)) == []
+    thumbnails = page.locator(".thumbnail")
+    solved = int((collect(RunFolder(run)).answers["status"] == "success").sum())
+    assert thumbnails.count() == solved > 3
+    widths = page.evaluate("[...document.querySelectorAll('.thumbnail img')].map((image) => image.naturalWidth)")
+    assert widths == [60] * solved
+    thumbnails.first.click()
+    assert page.locator("#picture-title").inner_text() == thumbnails.first.get_attribute("data-image")
+    page.keyboard.press("Escape")
+
+
+@needs_chromium
+def test_a_camera_looks_the_same_in_every_figure(small_run: Path, page: Page) -> None:
+    assert _open(page, _report(small_run)) == []
+    looks = page.evaluate(
+        "[...document.querySelectorAll('.plot')].flatMap((plot) => plot.data.filter((trace) => trace.name)"
+        ".map((trace) => [trace.name, (trace.marker && trace.marker.color) || trace.line.color]))"
+    )
+    cameras = set(collect(RunFolder(small_run)).answers["camera"])
+    seen = {camera: {colour for name, colour in looks if name == camera} for camera in cameras}
+    assert len(cameras) == 2
+    assert all(len(colours) == 1 for colours in seen.values())
+    assert len(set.union(*seen.values())) == 2
 
 
 @needs_chromium

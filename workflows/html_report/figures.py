@@ -1,6 +1,6 @@
 """Interactive figures of a run, from the rows of its tables."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 import pandas as pd
@@ -15,6 +15,22 @@ _HEIGHT, _BAR_HEIGHT = 340, 30
 # The page shows through, in its light and in its dark colours.
 _CLEAR = "rgba(0,0,0,0)"
 RANKS = ("high", "medium", "low", "conflicted", "failed")
+
+
+def looks(names: Iterable[object]) -> dict[str, int]:
+    """Number the names by which they get a colour and a shape.
+
+    Parameters
+    ----------
+    names
+        Repeated or not.
+
+    Returns
+    -------
+    dict
+        Numbers from 0 by name, in the order of the alphabet.
+    """
+    return {name: k for k, name in enumerate(sorted(set(map(str, names))))}
 
 
 def sample(rows: pd.DataFrame, most: int = MOST_POINTS) -> pd.DataFrame:
@@ -50,8 +66,9 @@ def _layout(figure: go.Figure, x: str, y: str) -> go.Figure:
 
 
 def scatter(
-    rows: pd.DataFrame, x: str, y: str, titles: tuple[str, str], by: str = "camera", log_y: bool = False
-) -> go.Figure:
+    rows: pd.DataFrame, x: str, y: str, titles: tuple[str, str], look: Mapping[str, int], by: str = "camera",
+    log_y: bool = False,
+) -> go.Figure:  # fmt: skip
     """One point per image, which its hover names.
 
     Parameters
@@ -62,6 +79,8 @@ def scatter(
         Columns.
     titles
         Of the axes.
+    look
+        Of :func:`looks`, of all values of that column.
     by
         Column whose values get a colour and a shape each.
     log_y
@@ -77,7 +96,8 @@ def scatter(
         figure.update_xaxes(categoryorder="array", categoryarray=RANKS)
     shown = sample(rows.dropna(subset=[x, y]).sort_values("image_id"))
     hover = f"<b>%{{customdata}}</b><br>%{{fullData.name}}<br>{titles[1]} %{{y}}<br>{titles[0]} %{{x}}<extra></extra>"
-    for k, (name, group) in enumerate(shown.groupby(by, observed=True)):
+    for name, group in shown.groupby(by, observed=True):
+        k = look[str(name)]
         figure.add_scatter(
             x=group[x].to_list(), y=group[y].to_list(), mode="markers", name=str(name),
             customdata=group["image_id"].to_list(),
@@ -118,7 +138,7 @@ def bars(names: Sequence[str], values: Sequence[float], titles: tuple[str, str])
     return figure
 
 
-def histogram(groups: dict[str, np.ndarray], titles: tuple[str, str]) -> go.Figure:
+def histogram(groups: dict[str, np.ndarray], titles: tuple[str, str], look: Mapping[str, int]) -> go.Figure:
     """Histograms of logarithms, one line each.
 
     Parameters
@@ -127,6 +147,8 @@ def histogram(groups: dict[str, np.ndarray], titles: tuple[str, str]) -> go.Figu
         Positive numbers by name.
     titles
         Of the axes.
+    look
+        Of :func:`looks`, of all names.
 
     Returns
     -------
@@ -135,8 +157,11 @@ def histogram(groups: dict[str, np.ndarray], titles: tuple[str, str]) -> go.Figu
     """
     figure = go.Figure()
     everything = np.concatenate([*groups.values(), np.array([1.0])])
-    edges = np.geomspace(max(everything.min(), 1e-4) * 0.9, everything.max() * 1.1, 41)
-    for k, (name, values) in enumerate(groups.items()):
+    # A few images in many bins are a fence of single ones.
+    count = int(np.clip(2.0 * np.sqrt(max(map(len, groups.values()), default=1)), 6, 40))
+    edges = np.geomspace(max(everything.min(), 1e-4) * 0.9, everything.max() * 1.1, count + 1)
+    for name, values in groups.items():
+        k = look[name]
         counts, _ = np.histogram(values, edges)
         figure.add_scatter(
             x=np.sqrt(edges[1:] * edges[:-1]).round(6).tolist(), y=counts.tolist(), mode="lines", line_shape="hvh",
@@ -147,7 +172,9 @@ def histogram(groups: dict[str, np.ndarray], titles: tuple[str, str]) -> go.Figu
     return figure
 
 
-def trend(bins: pd.DataFrame, y: str, titles: tuple[str, str], log_y: bool = False) -> go.Figure:
+def trend(
+    bins: pd.DataFrame, y: str, titles: tuple[str, str], look: Mapping[str, int], log_y: bool = False
+) -> go.Figure:
     """One line per camera over its spells of time.
 
     Parameters
@@ -158,6 +185,8 @@ def trend(bins: pd.DataFrame, y: str, titles: tuple[str, str], log_y: bool = Fal
         Column.
     titles
         Of the axes.
+    look
+        Of :func:`looks`, of all cameras.
     log_y
         Logarithmic ordinate.
 
@@ -167,7 +196,8 @@ def trend(bins: pd.DataFrame, y: str, titles: tuple[str, str], log_y: bool = Fal
         A point stands at the middle image of its spell.
     """
     figure = go.Figure()
-    for k, (camera, group) in enumerate(bins.groupby("camera", observed=True)):
+    for camera, group in bins.groupby("camera", observed=True):
+        k = look[str(camera)]
         figure.add_scatter(
             x=group["middle"].to_list(), y=group[y].to_list(), mode="lines+markers", name=str(camera),
             customdata=group[["images", "start", "stop"]].to_numpy().tolist(),
@@ -180,7 +210,9 @@ def trend(bins: pd.DataFrame, y: str, titles: tuple[str, str], log_y: bool = Fal
     return _layout(figure, *titles)
 
 
-def arrows(field: pd.DataFrame, cells: int, titles: tuple[str, str]) -> tuple[go.Figure, float]:
+def arrows(
+    field: pd.DataFrame, cells: int, titles: tuple[str, str], look: Mapping[str, int]
+) -> tuple[go.Figure, float]:
     """Mean residuals as arrows over the array, rows downward.
 
     Parameters
@@ -191,6 +223,8 @@ def arrows(field: pd.DataFrame, cells: int, titles: tuple[str, str]) -> tuple[go
         Along each side.
     titles
         Of the axes.
+    look
+        Of :func:`looks`, of all cameras.
 
     Returns
     -------
@@ -201,7 +235,8 @@ def arrows(field: pd.DataFrame, cells: int, titles: tuple[str, str]) -> tuple[go
     lengths = np.hypot(field["dv_px"], field["du_px"])
     # Most arrows stay inside their cell; a few cells of one feature may be far longer than all others.
     unit = float(max(np.quantile(lengths, 0.9), 1e-6)) if len(field) else 1.0
-    for k, (camera, group) in enumerate(field.groupby("camera", observed=True)):
+    for camera, group in field.groupby("camera", observed=True):
+        k = look[str(camera)]
         v, u = (group["row_cell"] + 0.5) / cells, (group["column_cell"] + 0.5) / cells
         tip_v, tip_u = v + group["dv_px"] / unit / cells, u + group["du_px"] / unit / cells
         nothing = [None] * len(group)

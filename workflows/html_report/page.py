@@ -3,7 +3,7 @@
 import base64
 import html
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,13 +14,13 @@ import plotly.graph_objects as go
 from plotly.offline import get_plotlyjs
 
 from pipeline.json_values import Json
-from workflows.html_report.figures import arrows, bars, histogram, scatter, trend
+from workflows.html_report.figures import arrows, bars, histogram, looks, scatter, trend
 from workflows.html_report.rows import FEWEST_IN_CELL, FIELD_CELLS, MOST_PULL, Change, RunRows, strangest
 from workflows.html_report.style import SCRIPT, STYLE
 from workflows.html_report.trend import spells, worse_than_usual
 
 _THUMBNAIL_PX = 720
-_MOST_LISTED, _MOST_EMBEDDED = 40, 36
+_MOST_LISTED, _MOST_EMBEDDED, _MOST_THUMBNAILS = 40, 36, 6
 MOST_STRANGENESS = 10.0
 """Sigmas from which an answer is said to be unlike its camera's others."""
 
@@ -81,15 +81,19 @@ def render(
     strange = strangest(rows.answers)
     lately = spells(rows.answers)
     worse = [*([] if change is None else _against(change)), *worse_than_usual(lately)]
-    parts = [_headline(title, rows, strange, worse)]
-    if change is not None:
-        parts.append(_changes(change))
-    parts += [_outcomes(rows), _trend(lately), _offsets(rows), _field(rows), _agreement(rows), _speed(rows)]
-    parts += [_strange(strange, rows), _failures(rows), _provenance(provenance)]
     first_failures = [image_id for ids in rows.failed["first_ids"] for image_id in ids[:3]]
     worst = [*rows.conflicts["image_id"], *rows.worst_pairs["image_id"]]
     wanted = [*strange["image_id"], *first_failures, *worst, *rows.slowest["image_id"]]
-    shown = {"pictures": pictures.embedded(wanted[:_MOST_EMBEDDED]), "address": pictures.address}
+    embedded = pictures.embedded(wanted[:_MOST_EMBEDDED])
+    # A camera looks the same in every figure.
+    look = looks(rows.answers["camera"])
+    parts = [_headline(title, rows, strange, worse)]
+    if change is not None:
+        parts.append(_changes(change))
+    parts += [_outcomes(rows), _trend(lately, look), _offsets(rows, look), _field(rows, look)]
+    parts += [_agreement(rows), _speed(rows), _strange(strange, rows, embedded)]
+    parts += [_failures(rows), _provenance(provenance)]
+    shown = {"pictures": embedded, "address": pictures.address}
     # A closing tag inside a script would end it.
     data = json.dumps(shown, sort_keys=True).replace("</", "<\\/")
     body = "\n".join(parts)
@@ -181,48 +185,48 @@ def _outcomes(rows: RunRows) -> str:
     return _section("Outcomes", _figure(figure, "outcomes", "Images by outcome and its reason."))
 
 
-def _offsets(rows: RunRows) -> str:
+def _offsets(rows: RunRows, look: Mapping[str, int]) -> str:
     solved = rows.answers.dropna(subset=["offset_dv_px"])
     sigmas = {
         str(camera): group["sigma_px"].to_numpy(float)[group["sigma_px"].to_numpy(float) > 0]
         for camera, group in solved.groupby("camera", observed=True)
     }
     parts = [
-        _figure(scatter(solved, "time_utc", "offset_dv_px", ("time (UTC)", "dv, px")), "dv-time",
+        _figure(scatter(solved, "time_utc", "offset_dv_px", ("time (UTC)", "dv, px"), look), "dv-time",
                 "Offset along rows against time."),
-        _figure(scatter(solved, "time_utc", "offset_du_px", ("time (UTC)", "du, px")), "du-time",
+        _figure(scatter(solved, "time_utc", "offset_du_px", ("time (UTC)", "du, px"), look), "du-time",
                 "Offset along columns against time."),
-        _figure(scatter(solved, "offset_du_px", "offset_dv_px", ("du, px", "dv, px")), "field",
+        _figure(scatter(solved, "offset_du_px", "offset_dv_px", ("du, px", "dv, px"), look), "field",
                 "Offsets of both axes: a camera's boresight error is a common shift."),
-        _figure(histogram(sigmas, ("sigma, px", "images")), "sigmas", "One sigma of the offset, by camera."),
-        _figure(scatter(solved, "rank", "sigma_px", ("rank", "sigma, px"), log_y=True), "rank",
+        _figure(histogram(sigmas, ("sigma, px", "images"), look), "sigmas", "One sigma of the offset, by camera."),
+        _figure(scatter(solved, "rank", "sigma_px", ("rank", "sigma, px"), look, log_y=True), "rank",
                 "Sigma against rank."),
     ]  # fmt: skip
     turned = solved.dropna(subset=["rotation_deg"])
     if len(turned):
         parts.append(
-            _figure(scatter(turned, "time_utc", "rotation_deg", ("time (UTC)", "rotation, deg")), "rotation",
+            _figure(scatter(turned, "time_utc", "rotation_deg", ("time (UTC)", "rotation, deg"), look), "rotation",
                     "Rotation against time, where it was fitted and seen.")
         )  # fmt: skip
     return _section("Offsets", '<div class="grid">', *parts, "</div>")
 
 
-def _trend(lately: pd.DataFrame) -> str:
+def _trend(lately: pd.DataFrame, look: Mapping[str, int]) -> str:
     if not len(lately):
         return _section("Trend", "<p>No image says when it was taken.</p>")
     return _section(
         "Trend", '<div class="grid">',
-        _figure(trend(lately, "solved_percent", ("time (UTC)", "navigated, %")), "solved-time",
+        _figure(trend(lately, "solved_percent", ("time (UTC)", "navigated, %"), look), "solved-time",
                 "Share of images navigated, by camera, in spells of equal number."),
-        _figure(trend(lately, "sigma_px", ("time (UTC)", "median sigma, px"), log_y=True), "sigma-time",
+        _figure(trend(lately, "sigma_px", ("time (UTC)", "median sigma, px"), look, log_y=True), "sigma-time",
                 "Median sigma of the answers of each spell."), "</div>",
     )  # fmt: skip
 
 
-def _field(rows: RunRows) -> str:
+def _field(rows: RunRows, look: Mapping[str, int]) -> str:
     if not len(rows.field):
         return _section("Residuals over the array", f"<p>No cell holds {FEWEST_IN_CELL} measured features.</p>")
-    figure, unit = arrows(rows.field, FIELD_CELLS, ("u, share of the columns", "v, share of the rows"))
+    figure, unit = arrows(rows.field, FIELD_CELLS, ("u, share of the columns", "v, share of the rows"), look)
     said = (
         f"Measured minus fitted places of used features, mean of {FIELD_CELLS} by {FIELD_CELLS} cells that hold "
         f"{FEWEST_IN_CELL} or more: an arrow from the cell's middle to its mark, a cell long for {unit:.3g} px. "
@@ -234,7 +238,8 @@ def _field(rows: RunRows) -> str:
 def _agreement(rows: RunRows) -> str:
     if not len(rows.by_pair):
         return _section("Agreement of techniques", "<p>No image has two techniques' answers that can be compared.</p>")
-    figure = scatter(rows.shown_pairs, "number", "pull", ("pair of answers", "joint sigmas"), by="pair", log_y=True)
+    titles = ("pair of answers", "joint sigmas")
+    figure = scatter(rows.shown_pairs, "number", "pull", titles, looks(rows.shown_pairs["pair"]), "pair", True)
     # Two dozen pairs would fill a narrow page with their key; hover names them.
     figure.update_layout(showlegend=False)
     return _section(
@@ -254,7 +259,7 @@ def _speed(rows: RunRows) -> str:
     )  # fmt: skip
 
 
-def _strange(strange: pd.DataFrame, rows: RunRows) -> str:
+def _strange(strange: pd.DataFrame, rows: RunRows, embedded: Mapping[str, str]) -> str:
     columns = ["image_id", "camera", "offset_dv_px", "offset_du_px", "sigma_px", "rank", "strangeness"]
     parts = [_table(
         strange[columns], "Farthest from the median of their camera, in sigmas of its scatter and their own"
@@ -262,7 +267,13 @@ def _strange(strange: pd.DataFrame, rows: RunRows) -> str:
     if len(rows.conflicts):
         said = "Conflicted: techniques contradict each other, by the largest distance in joint sigmas"
         parts.append(_table(rows.conflicts, said))
-    return _section("Strangest answers", *parts)
+    first = [image_id for image_id in strange["image_id"] if image_id in embedded][:_MOST_THUMBNAILS]
+    strip = "".join(
+        f'<button class="image thumbnail" data-image="{name}"><img alt="Summary picture of {name}"><span>{name}</span>'
+        "</button>"
+        for name in (html.escape(image_id, quote=True) for image_id in first)
+    )
+    return _section("Strangest answers", f'<div class="strip">{strip}</div>' if strip else "", *parts)
 
 
 def _failures(rows: RunRows) -> str:

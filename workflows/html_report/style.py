@@ -14,6 +14,9 @@ h2{font-size:1.2rem;margin:1.6rem 0 .5rem;border-bottom:1px solid var(--line)}he
 .tile.conflicted{border-left-color:#cc79a7}.tile.error{border-left-color:var(--none)}
 .grid{display:grid;grid-template-columns:repeat(auto-fit,minmax(min(100%,520px),1fr));gap:1rem}
 figure{margin:0;min-width:0}figcaption{color:var(--soft);font-size:.9rem}
+.strip{display:flex;flex-wrap:wrap;gap:.6rem;margin:.6rem 0}
+.thumbnail{display:flex;flex-direction:column;width:min(47%,190px);padding:.2rem}
+.thumbnail img{width:100%;height:170px;object-fit:contain}.thumbnail span{overflow-wrap:anywhere}
 .wide{overflow-x:auto;margin:.6rem 0}table{border-collapse:collapse;font-size:.9rem}
 caption{text-align:left;color:var(--soft);padding:.2rem 0}
 th,td{text-align:left;vertical-align:top;padding:.25rem .6rem;border-bottom:1px solid var(--line)}
@@ -46,6 +49,9 @@ function show(id) {
   body.append(picture);
   dialog.showModal();
 }
+// The file holds each picture once, for the dialog too.
+for (const button of document.querySelectorAll(".thumbnail"))
+  button.querySelector("img").src = pictures[button.dataset.image];
 document.addEventListener("click", (event) => {
   const button = event.target.closest("button.image");
   if (button) show(button.dataset.image);
@@ -61,6 +67,11 @@ const {"font.color": ink, "xaxis.gridcolor": line} = tints();
 for (const plot of document.querySelectorAll(".plot")) {
   const {data, layout} = JSON.parse(plot.nextElementSibling.textContent);
   layout.font.color = ink;
+  // A square map needs no more height than a narrow page's width and its key.
+  if (layout.yaxis.scaleanchor) {
+    layout.height = Math.min(layout.height, plot.clientWidth + 130);
+    plot.style.height = layout.height + "px";
+  }
   layout.xaxis.gridcolor = layout.yaxis.gridcolor = line;
   Plotly.newPlot(plot, data, layout, {displaylogo: false, responsive: true});
   plot.on("plotly_click", (event) => {
