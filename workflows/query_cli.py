@@ -47,6 +47,10 @@ def query(
         answer = pa.table({"table": list(counts), "rows": list(counts.values())})
     else:
         answer = ask(folder, sys.stdin.read() if question == _STDIN else question)
+    names = answer.column_names
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice and form is not Format.TABLE:
+        raise ConfigurationError(f"query: two columns are called {twice[0]}; name one of them by AS")
     data = _written(answer, form)
     if output is None:
         typer.echo(data.decode(), nl=False)

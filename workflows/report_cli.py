@@ -24,6 +24,8 @@ def report(
     folder = RunFolder(run_folder)
     rows = collect(folder)
     change = changes(collect_answers(RunFolder(compare)), rows.answers) if compare is not None else None
+    if change is not None and change.common == 0:
+        raise ConfigurationError(f"{run_folder} and {compare} have no image in common")
     provenance = read_json(run_folder / "run.json")
     if provenance is None:
         raise ConfigurationError(f"{run_folder} has no run.json: the run has not ended yet")

@@ -6,7 +6,7 @@ import os
 import re
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TextIO
@@ -185,9 +185,15 @@ def write_atomically(path: Path, data: bytes) -> None:
         Content.
     """
     temporary = path.with_name(f".{path.name}.{uuid4().hex}")
-    with temporary.open("wb") as file:
-        file.write(data)
-    os.replace(temporary, path)
+    try:
+        with temporary.open("wb") as file:
+            file.write(data)
+        os.replace(temporary, path)
+    except OSError as error:
+        # Who reads the message knows the file by its final name.
+        with suppress(OSError):
+            temporary.unlink()
+        raise OSError(error.errno, error.strerror, str(path)) from error
 
 
 def to_json(content: Mapping[str, Json]) -> bytes:
@@ -244,8 +250,10 @@ def document_of(folder: RunFolder, image_id: str) -> dict[str, Json]:
     Raises
     ------
     ConfigurationError
-        If the run has no such image.
+        If there is no run, or it has no such image.
     """
+    if not folder.plan.exists():
+        raise ConfigurationError(f"{folder.root} holds no run: it has no plan.json")
     document = read_json(folder.document(image_id))
     # The name of any other file beside the documents is no image either.
     if document is None or document.get("image_id") != image_id:

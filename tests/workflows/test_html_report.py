@@ -18,6 +18,7 @@ from playwright.sync_api import Page, sync_playwright
 
 from pipeline.tables import SCHEMAS
 from tests.scenes.runs import run_archive
+from tests.support import pilotage
 from workflows.cli import app
 from workflows.html_report.rows import changes, collect
 from workflows.samples.options import StarSampleOptions
@@ -267,6 +268,15 @@ def test_the_same_run_gives_the_same_page(small_run: Path) -> None:
     first = _report(small_run).read_bytes()
     assert _report(small_run, "--compare", str(small_run)).read_bytes() != first
     assert _report(small_run).read_bytes() == first
+
+
+def test_a_run_of_other_images_is_no_comparison(small_run: Path, tmp_path: Path) -> None:
+    other = Path(shutil.copytree(small_run, tmp_path / "other"))
+    for path in (other / "offsets").rglob("*.parquet"):
+        table = pq.ParquetFile(path).read()
+        ids = pa.array([f"other_{k}" for k in range(len(table))])
+        pq.write_table(table.set_column(table.schema.get_field_index("image_id"), "image_id", ids), path)
+    assert "no image in common" in pilotage("report", small_run, "--compare", other).refusal()
 
 
 def test_changes_tell_what_failed_what_was_solved_and_what_moved(small_run: Path) -> None:

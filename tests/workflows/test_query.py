@@ -99,6 +99,8 @@ def test_what_is_no_question_is_refused_in_one_line(run: Path, question: str, sa
 def test_combinations_that_say_nothing_are_refused(run: Path, tmp_path: Path) -> None:
     assert "--tables" in pilotage("query", run).refusal()
     assert "--output" in pilotage("query", run, QUESTION, "--format", "parquet").refusal()
+    assert "called a" in pilotage("query", run, "SELECT 1 AS a, 2 AS a", "--format", "json").refusal()
+    assert f"{run}/no/x.csv: No such file" in pilotage("query", run, "SELECT 1", "-o", run / "no" / "x.csv").refusal()
     assert "no tables" in pilotage("query", tmp_path / "none", QUESTION).refusal()
 
 
