@@ -1,8 +1,8 @@
 """Correlation of a maplet's predicted with its extracted image, and from its peak an offset with a covariance.
 
 Source: seed 001 section 3.5 with the project's corrections. A shift s in cells means predicted(x - s) ~ extracted(x).
-Beyond the document every peak carries a 2 x 2 covariance: a regression of the extracted image on the predicted one and
-its two derivatives, whose residuals may be correlated within blocks (sandwich estimate of White 1980, clustered).
+Beyond the document every peak carries a 2 x 2 covariance: that of a regression of the extracted image on the predicted
+one and its two derivatives, and what light that the cells do not resolve may add.
 """
 
 from dataclasses import dataclass
@@ -11,7 +11,6 @@ from typing import Literal
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from pipeline.geometry.maplet import Maplet, MapletView
@@ -25,6 +24,7 @@ from pipeline.imaging.maplet_images import (
 )
 from pipeline.options import Options
 from pipeline.records import BoolArray, FloatArray, Image, Record
+from pipeline.techniques.maplet_regression import overlap, regressed_shift, unresolved_shift
 
 # Shifts on each side: SPC's 11 x 11 grid.
 REACH = 5
@@ -302,64 +302,22 @@ def correlate(
     if not with_covariance:
         return Peak(PeakStatus.FOUND, (whole + step) * size, np.full((2, 2), np.nan), height, 0)
     block = max(_BLOCK_CELLS, round(_BLOCK_PX / pixels_per_cell / size))
-    regressed, covariance, cells = _regression(predicted, extracted, whole + widening // size, block)
+    regressed, covariance, cells = regressed_shift(predicted, extracted, whole + widening // size, block)
     apart = np.nan_to_num(regressed - step)
     if np.abs(apart).max() <= _MOST_APART_CELLS:
         step = step + apart / 2.0
     # Peak and regression weigh the same cells differently: what parts them is an error that the residuals do not show.
-    covariance = covariance + np.eye(2) * (apart @ apart) / 2.0
+    covariance = covariance + _of_one_draw(apart)
     return Peak(PeakStatus.FOUND, (whole + step) * size, covariance * size**2, height, cells)
+
+
+def _of_one_draw(error: FloatArray) -> FloatArray:
+    """Covariance of an error without preferred direction, of which one draw is known."""
+    return np.eye(2) * float(error @ error) / 2.0
 
 
 def _nothing(status: PeakStatus, height: float) -> Peak:
     return Peak(status, np.full(2, np.nan), np.full((2, 2), np.nan), height, 0)
-
-
-def _regression(
-    predicted: tuple[FloatArray, BoolArray],
-    extracted: tuple[FloatArray, BoolArray],
-    start: NDArray[np.int64],
-    block: int,
-) -> tuple[FloatArray, FloatArray, int]:
-    """Shift beyond a whole one in binned cells, its covariance, and how many cells they rest on.
-
-    The extracted image is regressed on light, level and both derivatives of the predicted one: predicted(x - s) has
-    -s times the derivatives. Scores are summed over blocks of cells before they are squared.
-    """
-    (p, mp), (e, me) = predicted, extracted
-    n, m = len(p), len(e)
-    here, there = _overlap(n, m, start)
-    p, mp, e, me = p[here], mp[here], e[there], me[there]
-    valid = mp & me
-    # A derivative needs both neighbours.
-    valid[1:-1, 1:-1] &= mp[2:, 1:-1] & mp[:-2, 1:-1] & mp[1:-1, 2:] & mp[1:-1, :-2]
-    valid[[0, -1]] = valid[:, [0, -1]] = False
-    i, j = np.nonzero(valid)
-    if len(i) < 20:
-        return np.full(2, np.nan), np.full((2, 2), np.nan), len(i)
-    dx, dy = 0.5 * (p[i + 1, j] - p[i - 1, j]), 0.5 * (p[i, j + 1] - p[i, j - 1])
-    columns = np.stack([p[i, j] - p[i, j].mean(), np.ones(len(i)), dx, dy], axis=1)
-    normal = columns.T @ columns
-    answer = np.linalg.lstsq(normal, columns.T @ e[i, j], rcond=None)[0]
-    residual = e[i, j] - columns @ answer
-    label = (i // block) * (n // block + 1) + j // block
-    scores = np.stack([np.bincount(label, column * residual) for column in columns.T], axis=1)
-    blocks = int((np.bincount(label) > 0).sum())
-    bread = np.linalg.pinv(normal)
-    sandwich = bread @ (scores.T @ scores) @ bread * blocks / max(blocks - 4, 1)
-    plain = bread * float(residual @ residual) / max(len(i) - 4, 1)
-    scale = max(abs(float(answer[0])), 1e-30)
-    # Blocks are few: a direction in which their scores happen to cancel keeps what independent cells would give.
-    return -answer[2:] / float(answer[0] or 1e-30), _larger(sandwich[2:, 2:], plain[2:, 2:]) / scale**2, len(i)
-
-
-def _larger(first: FloatArray, second: FloatArray) -> FloatArray:
-    """Smallest matrix that is not less than either of two covariances along the second one's own axes."""
-    root = np.linalg.cholesky(second + np.eye(2) * 1e-30)
-    inverse = np.linalg.inv(root)
-    values, vectors = np.linalg.eigh(inverse @ first @ inverse.T)
-    axes = root @ vectors
-    return np.asarray((axes * np.maximum(values, 1.0)) @ axes.T)
 
 
 def ladder(start: int, every_bin: bool) -> tuple[int, ...]:
@@ -430,7 +388,10 @@ def locate(
         if step >= len(bins) - 1 and np.abs(peak.shift_cells).max() < match.tolerance_cells:
             break
     found = peak.status is PeakStatus.FOUND
-    covariance = jacobian @ peak.covariance_cells2 @ jacobian.T
+    covariance = np.full((2, 2), np.nan)
+    if found:
+        unresolved = _of_one_draw(unresolved_shift(maplet, prepared, make))
+        covariance = jacobian @ (peak.covariance_cells2 + unresolved) @ jacobian.T
     place = offset if found else np.full(2, np.nan)
     return LandmarkMatch(
         peak.status, place, covariance, peak.correlation, peak.cells, size, images, scale, background
@@ -440,17 +401,10 @@ def locate(
 def _levels(images: MapletImages, peak: Peak, guard: float) -> tuple[float, float]:
     """Scale and background of a picture at the nearest whole shift."""
     widening = (len(images.extracted) - len(images.predicted)) // 2
-    here, there = _overlap(
+    here, there = overlap(
         len(images.predicted), len(images.extracted), np.rint(peak.shift_cells).astype(int) + widening
     )
     valid = images.predicted_valid[here] & images.extracted_valid[there]
     if not valid.any():
         return 0.0, 0.0
     return brightness_scale(images.predicted[here][valid], images.extracted[there][valid], peak.correlation, guard)
-
-
-def _overlap(n: int, m: int, start: NDArray[np.int64]) -> tuple[tuple[slice, ...], tuple[slice, ...]]:
-    """Parts of an (n, n) and an (m, m) image that cover each other, the first one beginning at a cell of the second."""
-    low, high = np.maximum(0, -start), np.minimum(n, m - start)
-    here = tuple(slice(int(a), int(b)) for a, b in zip(low, high, strict=True))
-    return here, tuple(slice(int(a + s), int(b + s)) for a, b, s in zip(low, high, start, strict=True))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pipeline.geometry.maplet import index_of
-from pipeline.imaging.maplet_images import MapletImageOptions, MapletImages
+from pipeline.imaging.maplet_images import MapletImageOptions, MapletImages, prepare_maplet
 from pipeline.predict.maplet_removal import RemovalOptions, removal_reason, removed_ratio
 from pipeline.predict.maplets import MapletReason, maplet_jacobian
 from pipeline.records import FloatArray
@@ -21,6 +21,7 @@ from pipeline.techniques.maplet_correlation import (
     quadratic_peak,
     taylor_peak,
 )
+from pipeline.techniques.maplet_regression import unresolved_shift
 from tests.pipeline.techniques.maplet_scene import maplet_on, picture_of, relief, view_down
 
 SUN = np.array([0.5, 0.3, 0.7])
@@ -154,14 +155,40 @@ def test_errors_of_noise_are_as_large_as_stated() -> None:
     rng = np.random.default_rng(6)
     options = (MapletImageOptions(), CorrelationOptions())
     base = locate(view, maplet, (clean.astype(np.float32), good), jacobian, np.zeros(2), options).offset_vu
+    # What cells leave unresolved is the same in every one of these pictures, so it is no part of their scatter.
+    unresolved = unresolved_shift(maplet, prepare_maplet(view, maplet, options[0]), options[0])
     pulls = []
     for _ in range(150):
         noisy = (clean + rng.normal(size=clean.shape) * 0.6 * clean.std()).astype(np.float32)
         match = locate(view, maplet, (noisy, good), jacobian, np.zeros(2), options)
         assert match.status is PeakStatus.FOUND
-        root = np.linalg.cholesky(match.covariance_px2)
-        pulls.append(np.linalg.solve(root, match.offset_vu - base))
+        of_noise = match.covariance_px2 - jacobian @ jacobian.T * (unresolved @ unresolved) / 2.0
+        pulls.append(np.linalg.solve(np.linalg.cholesky(of_noise), match.offset_vu - base))
     assert 0.8 < np.sqrt(np.mean(np.square(pulls))) < 1.25
+
+
+def test_coarser_cells_leave_more_unresolved_and_the_estimate_says_so() -> None:
+    """Pictures without noise, whose landmarks are off by what the cells do not resolve and the fit's own errors."""
+    told, wrong = {}, {}
+    options = MapletImageOptions()
+    for scale_km, half in ((0.04, 36), (0.12, 12)):
+        errors, shifts = [], []
+        for seed in range(6):
+            surface = relief(10 + seed)
+            maplet = maplet_on(surface, half, scale_km)
+            view = view_down(0.05, 0.3, 0.5 * seed, SUN, 100)
+            phase = np.arccos(view.sun @ view.position_km / 100.0)
+            image = picture_of(surface, view, np.zeros(2), float(np.exp(-np.degrees(phase) / 60))).astype(np.float32)
+            jacobian = maplet_jacobian(view, index_of([maplet]), np.array([0]))[0]
+            picture = (image, np.ones(image.shape, bool))
+            match = locate(view, maplet, picture, jacobian, np.zeros(2), (options, CorrelationOptions()))
+            errors.append(match.offset_vu)
+            shifts.append(jacobian @ unresolved_shift(maplet, prepare_maplet(view, maplet, options), options))
+            assert np.isfinite(match.covariance_px2).all()
+        told[scale_km], wrong[scale_km] = (float(np.sqrt(np.mean(np.square(x)))) for x in (shifts, errors))
+    assert told[0.12] > 2.0 * told[0.04]
+    # Waves without any detail below a cell converge faster than the first order that is assumed.
+    assert wrong[0.12] < told[0.12] < 4.0 * wrong[0.12]
 
 
 def test_eq_3_53_to_3_56_each_criterion_has_its_reason() -> None:
