@@ -25,6 +25,7 @@ from pipeline.imaging.maplet_images import (
 from pipeline.options import Options
 from pipeline.records import BoolArray, FloatArray, Image, Record
 from pipeline.techniques.maplet_regression import overlap, regressed_shift, unresolved_shift
+from pipeline.techniques.maplet_search import stands_alone, wide_surface, widest_bin
 
 # Shifts on each side: SPC's 11 x 11 grid.
 REACH = 5
@@ -46,17 +47,24 @@ class PeakStatus(StrEnum):
     ON_BORDER = "on_border"
     NO_MAXIMUM = "no_maximum"
     LOW_CORRELATION = "low_correlation"
+    AMBIGUOUS = "ambiguous"
 
 
 class CorrelationOptions(Options):
     """Grid, sub-pixel method and what counts as a match."""
 
-    bin_start: int = Field(1, ge=1, le=24, description="bin of the first correlation; it searches 5 bins to each side")
-    every_bin: bool = Field(False, description="go down by one bin at a time as SPC does, not by halves")
+    bin_start: int = Field(1, ge=1, le=24, description="5 bins of this size to each side are searched first")
+    every_bin: bool = Field(
+        False, description="go down by one bin at a time as SPC does; else by halves, after one wide search at a small bin"
+    )
     subpixel: Literal["quadratic", "taylor"] = Field("quadratic", description="fit of the peak, over 3 x 3 or per axis")
     least_correlation: float = Field(0.35, ge=-1, le=1, description="correlation below which nothing was found")
     least_cells: int = Field(100, ge=9, description="cells valid in both images that a correlation needs")
     passes: int = Field(4, ge=1, le=10, description="correlations at bin 1 at most, each on images extracted anew")
+    rival_share: float = Field(
+        0.6, gt=0, le=1,
+        description="from bin 2 on: what a peak may lack to a correlation of 1, over what the next one lacks",
+    )  # fmt: skip
     tolerance_cells: float = Field(0.1, gt=0, description="shift below which no further pass is needed, cells")
 
 
@@ -298,6 +306,8 @@ def correlate(
         return _nothing(PeakStatus.NO_MAXIMUM, height)
     if height < options.least_correlation:
         return _nothing(PeakStatus.LOW_CORRELATION, height)
+    if with_covariance and options.bin_start > 1 and not stands_alone(surface, (i, j), options.rival_share):
+        return _nothing(PeakStatus.AMBIGUOUS, height)
     whole = np.array([i - REACH, j - REACH])
     if not with_covariance:
         return Peak(PeakStatus.FOUND, (whole + step) * size, np.full((2, 2), np.nan), height, 0)
@@ -372,8 +382,18 @@ def locate(
     make, match = options
     pixels_per_cell = float(np.sqrt(abs(np.linalg.det(jacobian))))
     offset, scale, background = np.asarray(start_vu, float), 0.0, 0.0
-    bins = ladder(match.bin_start, match.every_bin)
-    prepared, grid, before = prepare_maplet(view, maplet, make), grid_pixels(view, maplet), 0
+    prepared, bins = prepare_maplet(view, maplet, make), ladder(match.bin_start, match.every_bin)
+    widest = widest_bin(len(maplet.heights))
+    if match.bin_start > widest and not match.every_bin:
+        # The pattern of few large bins is found anywhere.
+        far = grid_pixels(view, maplet, REACH * match.bin_start) + offset
+        images = images_of(prepared, picture, far, jacobian, make)
+        peak = _far_peak(images, widest, match.rival_share)
+        if peak.status is not PeakStatus.FOUND:
+            nowhere = np.full(2, np.nan), np.full((2, 2), np.nan)
+            return LandmarkMatch(peak.status, *nowhere, peak.correlation, peak.cells, widest, images)
+        offset, bins = offset + jacobian @ peak.shift_cells, ladder(widest, False)
+    grid, before = grid_pixels(view, maplet), 0
     for step, size in enumerate(bins + (1,) * (match.passes - 1)):
         search = REACH * size
         widening = search if search * pixels_per_cell > _WIDE_SEARCH_PX else 0
@@ -396,6 +416,23 @@ def locate(
     return LandmarkMatch(
         peak.status, place, covariance, peak.correlation, peak.cells, size, images, scale, background
     )  # fmt: skip
+
+
+def _far_peak(images: MapletImages, size: int, share: float) -> Peak:
+    """Best whole shift of bins of a size within the whole of a widened image, if it stands alone."""
+    widening = (len(images.extracted) - len(images.predicted)) // 2
+    inner = slice(widening % size, len(images.extracted) - widening % size)
+    predicted = bin_image(images.predicted, images.predicted_valid, size)
+    extracted = bin_image(images.extracted[inner, inner], images.extracted_valid[inner, inner], size)
+    surface = wide_surface(predicted, extracted)
+    place = np.array(np.unravel_index(int(surface.argmax()), surface.shape))
+    height = float(surface[tuple(place)])
+    if height <= -1.0:
+        return _nothing(PeakStatus.NO_VARIATION, 0.0)
+    if not stands_alone(surface, place, share):
+        return _nothing(PeakStatus.AMBIGUOUS, height)
+    shift = (place - len(surface) // 2) * float(size)
+    return Peak(PeakStatus.FOUND, shift, np.full((2, 2), np.nan), height, int(predicted[1].sum()))
 
 
 def _levels(images: MapletImages, peak: Peak, guard: float) -> tuple[float, float]:

@@ -12,8 +12,6 @@ from pipeline.techniques.ring_fit import fit_rings
 from pipeline.techniques.ring_search import RingFix
 
 NAME = "RingAnnulusNav"
-# It begins where the edges were found.
-_ROUNDS = 3
 
 
 class RingAnnulusOptions(TechniqueOptions):
@@ -58,7 +56,7 @@ def ring_annulus_nav(
     if fix.confidence < options.min_confidence:
         return TechniqueFailure(NAME, StatusReason.AMBIGUOUS_MATCH, "another place fits nearly as well")
     start = (fix.fit.offset_vu, fix.fit.rotation_rad)
-    fit = fit_rings(scene, frame, variance, start, context, True, _ROUNDS)
+    fit = fit_rings(scene, frame, variance, start, context, True)
     if isinstance(fit, str):
         return TechniqueFailure(NAME, StatusReason.NO_MATCH, fit)
     result = ring_result(NAME, scene, fix, fit, context, options, 1)

@@ -62,7 +62,13 @@ def observed(fit: RingFit, context: NavContext) -> Observed:
         covariance = np.asarray(np.linalg.inv(fit.information + prior))
         return _one_direction(covariance[:2, :2], fit.pivot_vu, size)
     if size == 3 and rotation_shows(fit.information, context):
-        return Observed(fit.information, fit.pivot_vu, 3)
+        covariance = np.asarray(np.linalg.inv(fit.information))[:2, :2]
+        if np.linalg.eigvalsh(covariance)[1] <= (_SEEN_SHARE * margin) ** 2:
+            return Observed(fit.information, fit.pivot_vu, 3)
+        # A turn about the rings' own centre, which looks like a shift along them.
+        prior = np.diag([3.0 / margin**2, 3.0 / margin**2, 3.0 / context.max_rotation_rad**2])
+        covariance = np.asarray(np.linalg.inv(fit.information + prior))[:2, :2]
+        return _one_direction(covariance, fit.pivot_vu, size, _bend(fit))
     settled = settle(fit.information, fit.pivot_vu, context)
     values = np.linalg.eigvalsh(settled.information[:2, :2])
     if values[0] < 1.0 / (_SEEN_SHARE * margin) ** 2:
@@ -72,12 +78,27 @@ def observed(fit: RingFit, context: NavContext) -> Observed:
     return Observed(settled.information, settled.pivot_vu, 2)
 
 
-def _one_direction(covariance: FloatArray, pivot_vu: FloatArray, size: int) -> Observed:
+def _one_direction(
+    covariance: FloatArray, pivot_vu: FloatArray, size: int, bend_per_px: float = 0.0
+) -> Observed:
+    """The direction across; along a bent edge an unknown way s lifts it by half of s^2 times the bend."""
     values, vectors = np.linalg.eigh(covariance)
     across = vectors[:, 0]
     information = np.zeros((size, size))
-    information[:2, :2] = np.outer(across, across) / values[0]
+    information[:2, :2] = np.outer(across, across) / (values[0] + (bend_per_px * values[1]) ** 2 / 2.0)
     return Observed(information, pivot_vu, 1)
+
+
+def _bend(fit: RingFit) -> float:
+    """Mean curvature of the edges, 1/px: how their normals turn over their places."""
+    normals, places = fit.units.normal_vu[fit.units.present], fit.units.places_vu[fit.units.present]
+    # Normals point outward, to one side each of the centre's: as axes they are alike.
+    normals = normals * np.where(normals @ normals[0] < 0, -1.0, 1.0)[:, None]
+    along = np.array([-normals[:, 1].mean(), normals[:, 0].mean()])
+    along /= max(float(np.hypot(*along)), 1e-12)
+    way, turn = places @ along, normals @ along
+    way = way - way.mean()
+    return abs(float(way @ turn)) / max(float(way @ way), 1e-12)
 
 
 def is_straight(fit: RingFit) -> bool:

@@ -77,7 +77,9 @@ def lattice_of(frame: Frame, variance: Image) -> Lattice:
     return Lattice(data - level, weight, step)
 
 
-def left_over(scene: RingScene, lattice: Lattice, offset_vu: FloatArray, rotation_rad: float) -> LeftOver:
+def left_over(
+    scene: RingScene, lattice: Lattice, offset_vu: FloatArray, rotation_rad: float, slack_px: float = 0.0
+) -> LeftOver:
     """Fit bands under a pointing.
 
     Parameters
@@ -88,6 +90,8 @@ def left_over(scene: RingScene, lattice: Lattice, offset_vu: FloatArray, rotatio
         Pixels.
     offset_vu, rotation_rad
         (2,) correction at the array centre, pixels; radians.
+    slack_px
+        Error of the place that is forgiven, as a wider blur.
 
     Returns
     -------
@@ -98,7 +102,7 @@ def left_over(scene: RingScene, lattice: Lattice, offset_vu: FloatArray, rotatio
     count = _PLANE + len(scene)
     gram, pull = np.zeros((count, count)), np.zeros(count)
     pose = scene.pose(offset_vu, rotation_rad)
-    blur = float(np.sqrt(scene.sigma_px**2 + PIXEL_VARIANCE))
+    blur = float(np.sqrt(scene.sigma_px**2 + PIXEL_VARIANCE + slack_px**2))
     power = band_equations(
         scene.rays.slopes, scene.origin, pose.turn, pose.observer_km, np.zeros(2), float(lattice.step), lattice.data,
         lattice.weight, scene.curves, scene.means, scene.spread, blur, scene.forms, scene.sun, gram, pull,

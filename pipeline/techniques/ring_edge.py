@@ -6,7 +6,8 @@ from pipeline.predict.rings import RingScene
 from pipeline.status import StatusReason
 from pipeline.techniques.base import NavContext, TechniqueFailure, TechniqueOptions, TechniqueResult
 from pipeline.techniques.ring_answer import ring_result
-from pipeline.techniques.ring_search import RingFix, RingSearchOptions
+from pipeline.techniques.ring_peaks import RingSearchOptions
+from pipeline.techniques.ring_search import RingFix
 
 NAME = "RingEdgeNav"
 

@@ -43,8 +43,11 @@ from pipeline.techniques.ring_solve import (
 from pipeline.techniques.ring_texture import blended, change_along, edge_scatter, loosened
 from pipeline.techniques.ring_units import RingUnits, make_units
 
-_ROUNDS, _INNER = 6, 2
-_SETTLED_PX = 0.004
+_ROUNDS, _INNER = 10, 2
+# A fit has settled when a round moves it by less than this, or by less than this share of its sigma.
+_SETTLED_PX, _SETTLED_SIGMAS = 0.004, 0.1
+# A last round that still moves it by more than this, in sigmas, has not found its place.
+_LOST_SIGMAS = 1.0
 # Widening of the blur in the first round, to reach edges that are off by a pixel or two.
 _FIRST_WIDENING = 1.5
 # From this round on units are doubted: before, the edges have not found their places.
@@ -54,7 +57,8 @@ _LEAST_VARIANCE_PX2, _MOST_WIDENING = PIXEL_VARIANCE + 0.05, 4.0
 _MOST_PIXELS = 400_000
 # Edges nearer to each other than so many blurs make one step.
 _ONE_STEP_BLURS = 1.5
-_FARTHEST_STEP_PX = 3.0
+# Farthest that a step moves an edge across itself, and the array's centre.
+_FARTHEST_ACROSS_PX, _FARTHEST_PX = 3.0, 30.0
 # Units and pixels are chosen anew when the edges have moved so far.
 _RENEWED_PX, _SLACK_PX = 0.7, 2.0
 _TINY = 1e-12
@@ -139,6 +143,7 @@ class _Round:
     width: float
     radii: Radii
     moved_px: float
+    moved_sigmas: float
     fit: RingFit | None
 
 
@@ -182,9 +187,8 @@ def smoothed_variance(frame: Frame) -> Image:
 
 
 def fit_rings(
-    scene: RingScene, frame: Frame, variance: Image, start: tuple[FloatArray, float], context: NavContext, tied: bool,
-    rounds: int = _ROUNDS,
-) -> RingFit | str:  # fmt: skip
+    scene: RingScene, frame: Frame, variance: Image, start: tuple[FloatArray, float], context: NavContext, tied: bool
+) -> RingFit | str:
     """Fit all edges from a start that is right to a pixel or two.
 
     Parameters
@@ -201,8 +205,6 @@ def fit_rings(
         Bounds.
     tied
         Whether a unit's contrasts are one multiple of the predicted ones (a template) or all free.
-    rounds
-        Most linearisations.
 
     Returns
     -------
@@ -210,13 +212,15 @@ def fit_rings(
         Or in one line why there is none.
     """
     job = _Job(scene, frame, variance, context, layout_of(scene, context), tied, lattice_of(frame, variance))
-    now = _Round(np.asarray(start[0], float), float(start[1]), 0.0, first_radii(scene, job.layout), np.inf, None)
+    radii = first_radii(scene, job.layout)
+    now = _Round(np.asarray(start[0], float), float(start[1]), 0.0, radii, np.inf, np.inf, None)
     units: RingUnits | None = None
     flat = np.zeros(0, np.int64)
     wandered = np.inf
-    for turn in range(rounds):
+    # A template starts from a fit of free edges.
+    for turn in range(int(tied), _ROUNDS):
         pose = scene.pose(now.offset_vu, now.rotation_rad)
-        if units is None or wandered > _RENEWED_PX or turn == 1:
+        if units is None or wandered > _RENEWED_PX or (turn == 1 and not tied):
             units = make_units(scene, pose, 2.0 * job.reach_px)
             if units is None or not len(units):
                 return "no edge is inside the array"
@@ -235,10 +239,12 @@ def fit_rings(
         wandered += now.moved_px
         if not _inside(now, context):
             return "the fit ran out of the search's bounds"
-        if turn >= _DOUBT_FROM and now.moved_px < _SETTLED_PX:
+        if turn >= _DOUBT_FROM and (now.moved_px < _SETTLED_PX or now.moved_sigmas < _SETTLED_SIGMAS):
             break
     if now.fit is None or units is None:
         return "no edge is inside the array"
+    if now.moved_sigmas > _LOST_SIGMAS and now.moved_px > _RENEWED_PX:
+        return "the fit did not settle"
     return _placed(now.fit, now, units)
 
 
@@ -249,7 +255,8 @@ def _placed(fit: RingFit, now: _Round, units: RingUnits) -> RingFit:
 def _inside(now: _Round, context: NavContext) -> bool:
     arm = float(np.hypot(*context.camera_model.shape_vu)) / 2
     bound = np.array(context.search_margin_vu) * 1.2 + 5.0 + context.max_rotation_rad * arm
-    return bool(np.isfinite(now.offset_vu).all() and (np.abs(now.offset_vu) <= bound).all())
+    turned = abs(now.rotation_rad) <= context.max_rotation_rad * 1.2 + 5.0 / arm
+    return bool(np.isfinite(now.offset_vu).all() and (np.abs(now.offset_vu) <= bound).all() and turned)
 
 
 def _carried(units: RingUnits, before: _Round, after: _Round, context: NavContext) -> RingUnits:
@@ -302,23 +309,24 @@ def _linearised(job: _Job, now: _Round, units: RingUnits, pixels: _Pixels, turn:
     pivot = np.asarray(units.places_vu[:, 0].mean(axis=0))
     levers = levers_of(units, pivot)
     weight = np.ones(len(units))
+    base = np.append(now.offset_vu, now.rotation_rad)[: layout.size]
     values = np.concatenate([np.zeros(layout.size), [_FIRST_WIDENING if first else now.width], now.radii.values])
     for _ in range(_INNER):
         equations = _equations(job, units, pixels, levers, values)
         if not (equations.freedom > 0).any():
             return "no edge has enough pixels"
-        if turn >= _DOUBT_FROM:
-            weight = unit_weights(equations)
         loose = loosened(equations, units, layout, now.radii)
-        step = step_of(system_of(loose, weight, levers, layout, values), layout, now.radii, first)
+        if turn >= _DOUBT_FROM:
+            weight = unit_weights(loose)
+        step = step_of(system_of(loose, weight, levers, layout, values), layout, now.radii, first, base)
         if not np.isfinite(step).all():
             return "the fit is degenerate"
-        step *= min(1.0, _FARTHEST_STEP_PX / max(float(np.hypot(*step[:2])), _TINY))
-        values = values + step
+        values = values + step * _shortening(step, levers, layout)
         least = _LEAST_VARIANCE_PX2 - layout.blur2
         values[layout.size] = np.clip(values[layout.size], least, _MOST_WIDENING * layout.blur2)
     equations = _equations(job, units, pixels, levers, values)
-    weight = unit_weights(equations) if turn >= _DOUBT_FROM else weight
+    if turn >= _DOUBT_FROM:
+        weight = unit_weights(loosened(equations, units, layout, now.radii))
     solved = (equations, weight, levers, values)
     fit, radii = _concluded(job, units, solved, now.radii, pivot, turn >= 1)
     full = np.zeros(3)
@@ -326,7 +334,18 @@ def _linearised(job: _Job, now: _Round, units: RingUnits, pixels: _Pixels, turn:
     offset, rotation = compose(job.context, now.offset_vu, now.rotation_rad, pivot, full)
     arm = float(np.hypot(*(units.places_vu[:, 0] - pivot).T).max())
     moved = float(np.hypot(*full[:2])) + abs(float(full[2])) * arm
-    return _Round(offset, rotation, 0.0 if first else float(values[layout.size]), radii, moved, fit)
+    step_made = full[: layout.size]
+    sigmas = float(np.sqrt(np.maximum(np.vdot(step_made, fit.information @ step_made), 0.0)))
+    return _Round(offset, rotation, 0.0 if first else float(values[layout.size]), radii, moved, sigmas, fit)
+
+
+def _shortening(step: FloatArray, levers: Levers, layout: Layout) -> float:
+    """Share of a step that leaves the edges within the reach of their blur, and the plane of the image flat."""
+    pointing = np.concatenate([step[: layout.size], np.zeros(len(step) - layout.size)])
+    across = float(np.abs(shifts_of(levers, layout, pointing)).max(initial=0.0))
+    return min(
+        1.0, _FARTHEST_ACROSS_PX / max(across, _TINY), _FARTHEST_PX / max(float(np.hypot(*step[:2])), _TINY)
+    )
 
 
 def _equations(job: _Job, units: RingUnits, pixels: _Pixels, levers: Levers, values: FloatArray) -> Equations:
@@ -377,7 +396,7 @@ def _concluded(
     equations, weight, levers, values = solved
     layout = job.layout
     size, features = layout.size, layout.features
-    chi2, rank = misfit(equations)
+    chi2, rank = misfit(loosened(equations, units, layout, radii))
     freedom = float((weight * rank).sum())
     excess = max(1.0, float((weight * chi2).sum()) / max(freedom - min(float(size), freedom / 2), 1.0))
     calm = scaled(equations, excess)

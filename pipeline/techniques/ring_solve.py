@@ -137,13 +137,16 @@ class Radii:
     free
         (features + edges,) True where nothing is.
     along
-        Variance over so many pixels along an edge, as a share of the edges' own.
+        (edges,) variance of single pieces along an edge, px^2.
+    wild
+        (edges,) factor on the variance of edges that are off by more than usual.
     """
 
     values: FloatArray
     sigma: FloatArray
     free: BoolArray
-    along: float
+    along: FloatArray
+    wild: FloatArray
 
 
 def first_radii(scene: RingScene, layout: Layout) -> Radii:
@@ -151,7 +154,7 @@ def first_radii(scene: RingScene, layout: Layout) -> Radii:
     first = np.unique(scene.feature, return_index=True)[1]
     known = np.maximum(scene.sigma_km[first], _PERFECT_PX * layout.km_per_px)
     sigma = np.concatenate([known, np.full(len(scene), _LOOSE_PX)])
-    return Radii(np.zeros(len(sigma)), sigma, np.zeros(len(sigma), bool), 0.0)
+    return Radii(np.zeros(len(sigma)), sigma, np.zeros(len(sigma), bool), np.zeros(len(scene)), np.ones(len(scene)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -256,7 +259,7 @@ def scaled(equations: Equations, factor: float) -> Equations:
 
 def misfit(equations: Equations) -> tuple[FloatArray, FloatArray]:
     """(n,) chi-square by which each unit's own shifts would lower its misfit, and their number."""
-    size = max(int((np.diagonal(equations.gram, axis1=1, axis2=2) > 0).sum(axis=1).max(initial=1)), 1)
+    size = told_size(equations.gram)
     gram, pull = equations.gram[:, :size, :size], equations.pull[:, :size]
     diagonal = np.diagonal(gram, axis1=1, axis2=2)
     largest = diagonal.max(axis=1, keepdims=True)
@@ -265,6 +268,12 @@ def misfit(equations: Equations) -> tuple[FloatArray, FloatArray]:
     own = np.linalg.solve(gram + ridge[:, :, None] * np.eye(size), pull[:, :, None])[:, :, 0]
     rank = (~empty).sum(axis=1) * (largest[:, 0] > 0)
     return np.maximum((own * pull).sum(axis=1), 0.0), rank.astype(float)
+
+
+def told_size(gram: FloatArray) -> int:
+    """Unknowns of the largest unit: behind them all matrices are zero."""
+    told = np.nonzero((np.diagonal(gram, axis1=1, axis2=2) > 0).any(axis=0))[0]
+    return int(told.max(initial=0)) + 1
 
 
 def unit_weights(equations: Equations) -> FloatArray:
@@ -325,10 +334,15 @@ def prior_of(layout: Layout, radii: Radii, hold_blur: bool) -> FloatArray:
     return prior
 
 
-def step_of(system: System, layout: Layout, radii: Radii, hold_blur: bool) -> FloatArray:
-    """(parameters,) Gauss-Newton step; not-a-number where the equations are singular."""
+def step_of(system: System, layout: Layout, radii: Radii, hold_blur: bool, base: FloatArray) -> FloatArray:
+    """(parameters,) Gauss-Newton step; not-a-number where the equations are singular.
+
+    ``base`` (size,) is the pointing that the values are added to: the search's bounds keep their sum where edges do not
+    tell it.
+    """
     prior = prior_of(layout, radii, hold_blur)
     pull = system.pull - prior * system.values
+    pull[: layout.size] -= (base + system.values[: layout.size]) / layout.bounds**2
     if hold_blur:
         pull[layout.size] = 0.0
     damping = _TINY * np.diag(system.gram)
@@ -370,7 +384,7 @@ def without_outlier(system: System, layout: Layout, radii: Radii, px_per_km: Flo
     count = layout.features
     if count <= _LEAST_OTHERS:
         return radii
-    sigma_all = np.concatenate([radii.sigma[:count], texture * layout.texture_px])
+    sigma_all = np.concatenate([radii.sigma[:count], texture * layout.texture_px * np.sqrt(radii.wild)])
     prior = prior_of(layout, replace(radii, sigma=sigma_all), False)
     prior[: layout.size] = 1.0 / layout.bounds**2
     inverse = inverse_of(system.gram + np.diag(prior))
@@ -405,13 +419,16 @@ def inverse_of(matrix: FloatArray) -> FloatArray:
 
 def own_shifts(equations: Equations, units: RingUnits) -> tuple[FloatArray, FloatArray]:
     """(n, 10) shifts that the units want beyond the fit, and their sigmas; not-a-number where they tell nothing."""
-    size = equations.gram.shape[1]
-    diagonal = np.diagonal(equations.gram, axis1=1, axis2=2)
+    size = told_size(equations.gram)
+    gram = equations.gram[:, :size, :size]
+    diagonal = np.diagonal(gram, axis1=1, axis2=2)
     largest = diagonal.max(axis=1, keepdims=True)
     silent = diagonal <= 1e-6 * largest
     ridge = np.where(silent, np.where(largest > 0, largest, 1.0), 1e-6 * diagonal)
-    inverse = np.linalg.inv(equations.gram + ridge[:, :, None] * np.eye(size))
-    shift = (inverse @ equations.pull[:, :, None])[:, :MOST_EDGES, 0]
-    sigma = np.sqrt(np.maximum(np.diagonal(inverse, axis1=1, axis2=2)[:, :MOST_EDGES], 0.0))
-    unknown = silent[:, :MOST_EDGES] | ~units.present
-    return np.where(unknown, np.nan, shift), np.where(unknown, np.nan, sigma)
+    inverse = np.linalg.inv(gram + ridge[:, :, None] * np.eye(size))
+    shift, sigma = np.full((2, *units.present.shape), np.nan)
+    count = min(size, MOST_EDGES)
+    known = ~silent[:, :count] & units.present[:, :count]
+    shift[:, :count][known] = (inverse @ equations.pull[:, :size, None])[:, :count, 0][known]
+    sigma[:, :count][known] = np.sqrt(np.maximum(np.diagonal(inverse, axis1=1, axis2=2)[:, :count], 0.0))[known]
+    return shift, sigma

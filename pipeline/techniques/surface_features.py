@@ -275,7 +275,9 @@ def _match(
 ) -> tuple[LandmarkMatch, str]:
     options = search.options
     size = max(1, int(np.ceil(reach[0] * ratio / _USABLE_BINS)))
-    correlation = options.correlation.model_copy(update={"bin_start": size, "passes": reach[1]})
+    # Where the others lie tells a wrong peak better than its rivals do.
+    update = {"bin_start": size, "passes": reach[1], "rival_share": 1.0}
+    correlation = options.correlation.model_copy(update=update)
     match = locate(view, maplet, search.picture, jacobian, np.zeros(2), (options.images, correlation))
     reason = removal_reason(match.images, ratio, maplet.name, options.removed_by_hand, options.removal)
     return match, match.status.value if reason is MapletReason.USED else reason.name.lower()
