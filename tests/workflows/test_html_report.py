@@ -192,6 +192,12 @@ def test_the_keyboard_reaches_images_and_every_figure_has_words(small_run: Path,
     page.keyboard.press("Enter")
     assert page.locator("#picture-title").inner_text() == button.get_attribute("data-image")
     page.keyboard.press("Escape")
+    page.locator("nav a", has_text="Strangest answers").focus()
+    page.keyboard.press("Enter")
+    page.keyboard.press("Tab")
+    assert page.evaluate("document.activeElement.closest('section').querySelector('h2').textContent") == (
+        "Strangest answers"
+    )
     for figure in page.locator("figure").all():
         assert figure.get_attribute("aria-label") == figure.locator("figcaption").inner_text()
 

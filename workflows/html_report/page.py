@@ -3,6 +3,7 @@
 import base64
 import html
 import json
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -94,6 +95,7 @@ def render(
     parts += [_agreement(rows), _speed(rows), _strange(strange, rows, embedded)]
     parts += [_failures(rows), _provenance(provenance)]
     shown = {"pictures": embedded, "address": pictures.address}
+    parts.insert(1, _contents(parts[1:]))
     # A closing tag inside a script would end it.
     data = json.dumps(shown, sort_keys=True).replace("</", "<\\/")
     body = "\n".join(parts)
@@ -112,6 +114,13 @@ def _section(name: str, *content: str) -> str:
     return f'<section aria-labelledby="{anchor}"><h2 id="{anchor}">{html.escape(name)}</h2>\n' + "\n".join(content) + (
         "\n</section>"
     )
+
+
+def _contents(sections: Sequence[str]) -> str:
+    """Links to the sections: figures' own buttons are many steps for who goes by keyboard."""
+    names = [re.search(r'<h2 id="([^"]*)">(.*?)</h2>', section) for section in sections]
+    links = " ".join(f'<a href="#{name[1]}">{name[2]}</a>' for name in names if name)
+    return f'<nav aria-label="Sections">{links}</nav>'
 
 
 def _figure(figure: go.Figure, name: str, said: str) -> str:

@@ -14,6 +14,7 @@ h2{font-size:1.2rem;margin:1.6rem 0 .5rem;border-bottom:1px solid var(--line)}he
 .tile.conflicted{border-left-color:#cc79a7}.tile.error{border-left-color:var(--none)}
 .grid{display:grid;grid-template-columns:repeat(auto-fit,minmax(min(100%,520px),1fr));gap:1rem}
 figure{margin:0;min-width:0}figcaption{color:var(--soft);font-size:.9rem}
+nav{display:flex;flex-wrap:wrap;gap:.2rem 1rem;margin:.8rem 0}a{color:var(--link)}
 .strip{display:flex;flex-wrap:wrap;gap:.6rem;margin:.6rem 0}
 .thumbnail{display:flex;flex-direction:column;width:min(47%,190px);padding:.2rem}
 .thumbnail img{width:100%;height:170px;object-fit:contain}.thumbnail span{overflow-wrap:anywhere}
@@ -22,7 +23,7 @@ caption{text-align:left;color:var(--soft);padding:.2rem 0}
 th,td{text-align:left;vertical-align:top;padding:.25rem .6rem;border-bottom:1px solid var(--line)}
 button{font:inherit;color:var(--link);background:var(--key);border:1px solid var(--edge);border-radius:4px;
 padding:.05rem .4rem;cursor:pointer}button.image{font-size:.85rem;margin:.1rem}button:focus-visible,
-.wide:focus-visible,pre:focus-visible
+.wide:focus-visible,pre:focus-visible,a:focus-visible
 {outline:3px solid #0072b2;outline-offset:1px}
 pre{overflow:auto;max-height:24rem;background:var(--box);padding:.6rem;font-size:.8rem}
 dialog{color:var(--ink);background:var(--paper)}
