@@ -2,8 +2,10 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from hashlib import blake2b
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.curate import Json
 from pipeline.errors import ContractError
@@ -12,7 +14,7 @@ from pipeline.geometry.rotations import matrix_from_quaternion
 from pipeline.geometry.wgs84 import Datum, wgs84
 from pipeline.pose.arc_factors import AttitudeFix, DirectionFix
 from pipeline.pose.records import CameraCalibration, MatchError, MatchResult, Pose
-from pipeline.records import CameraModel, FloatArray, Record
+from pipeline.records import BoolArray, CameraModel, FloatArray, Record
 
 _STARS, _LANDMARKS = "Star", "SurfaceFeatureNav"
 # Of what an offset leaves open, rad^-2: nothing beside any other source, but it lets information be inverted.
@@ -131,7 +133,7 @@ def landmark_matches(image_id: str, columns: Mapping[str, Json]) -> MatchResult:
     Returns
     -------
     MatchResult
-        One match per landmark found.
+        One match per landmark found; a point's number is that of its landmark's name, the same in all images.
 
     Raises
     ------
@@ -157,7 +159,21 @@ def landmark_matches(image_id: str, columns: Mapping[str, Json]) -> MatchResult:
         spread = np.zeros((len(upper), 3, 3))
         for k, (i, j) in enumerate(zip(*np.triu_indices(3), strict=True)):
             spread[:, i, j] = spread[:, j, i] = upper[:, k]
-    return MatchResult(image_id, np.flatnonzero(found), observed[found], places, covariance, spread)
+    numbers = _numbers_of(columns.get("landmark"), np.asarray(found))
+    return MatchResult(image_id, numbers, observed[found], places, covariance, spread)
+
+
+def _numbers_of(names: Json, found: BoolArray) -> NDArray[np.int64]:
+    """Numbers of the landmarks found, of their names; rows where these are missing or come twice."""
+    rows = np.flatnonzero(found)
+    if not isinstance(names, list) or len(names) != len(found):
+        return rows
+    told = [str(names[row]) for row in rows]
+    if len(set(told)) < len(told):
+        return rows
+    # 63 bits: two of a million names meet with a chance of 1e-7.
+    digests = [blake2b(name.encode(), digest_size=8).digest() for name in told]
+    return np.array([int.from_bytes(digest) >> 1 for digest in digests], dtype=np.int64)
 
 
 def _stack(columns: Mapping[str, Json], *names: str) -> FloatArray:

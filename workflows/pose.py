@@ -14,6 +14,7 @@ from catalogs.matches import Cameras, MatchTable
 from pipeline.camera import project
 from pipeline.errors import ConfigurationError
 from pipeline.geometry.rotations import quaternion_from_matrix
+from pipeline.pose.arc_landmarks import PointSightings, sightings_of
 from pipeline.pose.bundle import Bundle, adjust
 from pipeline.pose.estimator import OpenCVGtsamPoseEstimator, PoseOptions, place_of, vehicle_orientation
 from pipeline.pose.records import (
@@ -86,12 +87,16 @@ class Budget:
 
 @dataclass(frozen=True)
 class PoseRow:
-    """Answer for one view; ``answer`` is the failure where there is no pose. Clocks are for the table of timings."""
+    """Answer for one view; ``answer`` is the failure where there is no pose. Clocks are for the table of timings.
+
+    ``sightings`` are what a pose rests on, by the points' numbers in the file; None where nobody asked for them.
+    """
 
     view_id: int
     answer: PoseEstimate | PnpFailureError
     seconds: float = 0.0
     emitted_at_ns: int | None = None
+    sightings: PointSightings | None = None
 
 
 @dataclass(frozen=True)
@@ -201,7 +206,7 @@ def prepare(table: MatchTable, cameras: Cameras) -> Views:
     return Views(ids, points, sightings, given, away, calibration, options, table, throttled)
 
 
-def solve_views(views: Views, budget: Budget, every: bool) -> Iterable[PoseRow]:
+def solve_views(views: Views, budget: Budget, every: bool, with_sightings: bool = False) -> Iterable[PoseRow]:
     """Solve the views without poses, each alone.
 
     Parameters
@@ -212,6 +217,8 @@ def solve_views(views: Views, budget: Budget, every: bool) -> Iterable[PoseRow]:
         For covariances.
     every
         Also solve the views whose poses are given, each with points from the others.
+    with_sightings
+        Keep what each pose rests on, for arcs that solve their points.
 
     Yields
     ------
@@ -237,7 +244,11 @@ def solve_views(views: Views, budget: Budget, every: bool) -> Iterable[PoseRow]:
             begun = time.monotonic()
             answer = solve_view(estimator, views.calibration, matches, state)
         emitted = time.monotonic_ns() if isinstance(answer, PoseEstimate) else None
-        yield PoseRow(int(view_id), answer, time.monotonic() - begun, emitted)
+        spent, seen = time.monotonic() - begun, None
+        if with_sightings and isinstance(answer, PoseEstimate):
+            seen = sightings_of(matches, answer, views.calibration, views.options.assumed_sigma_px)
+            seen = None if seen is None else replace(seen, point_id=views.points[seen.point_id])
+        yield PoseRow(int(view_id), answer, spent, emitted, seen)
 
 
 def _refused(views: Views, rows: BoolArray) -> PnpFailureError | None:

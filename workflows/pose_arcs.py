@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import combinations_with_replacement
 
 import numpy as np
 import pyarrow as pa
@@ -28,6 +29,13 @@ from pipeline.records import FloatArray
 from workflows.pose import PoseRow
 
 _TOLD = ("position_sigma_km", "walk_km_per_sqrt_s", "attitude_sigma_rad", "boresight_sigma_rad", "twist_sigma_rad")
+_AXES = "xyz"
+_PAIRS = tuple(combinations_with_replacement(enumerate(_AXES), 2))
+POINT_SCHEMA = pa.schema([
+    ("arc_id", pa.string()), ("point_id", pa.int64()), ("sightings", pa.int64()),
+    *[(f"{axis}_km", pa.float64()) for axis in _AXES],
+    *[(f"cov_{a}{b}_km2", pa.float64()) for (_, a), (_, b) in _PAIRS],
+])  # fmt: skip
 Row = dict[str, str | int | float | bool | None]
 
 
@@ -53,10 +61,11 @@ class ArcMember:
 
 @dataclass(frozen=True)
 class SmoothedArc:
-    """Rows of tables ``poses`` and ``arcs``."""
+    """Rows of tables ``poses`` and ``arcs``, and of the points that were solved with the poses."""
 
     poses: list[Row]
     summary: Row
+    points: list[Row]
 
 
 def members_of(arc: Arc, rows: Sequence[PoseRow], calibration: CameraCalibration) -> list[ArcMember]:
@@ -77,9 +86,13 @@ def members_of(arc: Arc, rows: Sequence[PoseRow], calibration: CameraCalibration
         In the order of the arc.
     """
     answers = {row.view_id: row.answer for row in rows}
+    seen = {row.view_id: row.sightings for row in rows}
     return [
         ArcMember(
-            ArcImage(str(view.view_id), view.et, view.prior, fix_of(answers.get(view.view_id))),
+            ArcImage(
+                str(view.view_id), view.et, view.prior, fix_of(answers.get(view.view_id)),
+                sightings=seen.get(view.view_id),
+            ),
             answers.get(view.view_id), calibration, view.view_id,
         )
         for view in arc.views
@@ -149,7 +162,7 @@ def smooth_members(identity: ArcIdentity, members: Sequence[ArcMember], options:
         raise ConfigurationError(f"arc {identity.arc_id}: {error}") from error
     poses = [_pose_row(identity, member, k, result) for k, member in enumerate(members)]
     used: Row = {name: getattr(options, name) for name in _TOLD}
-    return SmoothedArc(poses, _arc_row(identity, members, result) | used)
+    return SmoothedArc(poses, _arc_row(identity, members, result) | used, _point_rows(identity, result))
 
 
 def table_of(rows: Sequence[Row], schema: pa.Schema) -> pa.Table:
@@ -217,6 +230,20 @@ def _pose_row(identity: ArcIdentity, member: ArcMember, index: int, result: ArcR
     return row
 
 
+def _point_rows(identity: ArcIdentity, result: ArcResult) -> list[Row]:
+    if result.landmarks is None:
+        return []
+    points = result.landmarks
+    return [
+        {
+            "arc_id": identity.arc_id, "point_id": int(points.point_id[k]), "sightings": int(points.sightings[k]),
+            **{f"{axis}_km": float(points.places_km[k, i]) for i, axis in enumerate(_AXES)},
+            **{f"cov_{a}{b}_km2": float(points.covariance_km2[k, i, j]) for (i, a), (j, b) in _PAIRS},
+        }
+        for k in range(len(points.point_id))
+    ]  # fmt: skip
+
+
 def _arc_row(identity: ArcIdentity, members: Sequence[ArcMember], result: ArcResult) -> Row:
     sigma = np.sqrt(np.diag(result.bias_covariance_rad2))
     row: Row = {
@@ -226,6 +253,7 @@ def _arc_row(identity: ArcIdentity, members: Sequence[ArcMember], result: ArcRes
             member.image.fix is not None and not used for member, used in zip(members, result.used, strict=True)
         ),
         "offsets_used": int(result.offset_used.sum()),
+        "landmarks_solved": 0 if result.landmarks is None else len(result.landmarks.point_id),
         "anchored": result.label.count(SourceLabel.SATELLITE_ANCHORED),
         "propagated": result.label.count(SourceLabel.VISUAL_PROPAGATED),
         "dead_reckoned": result.label.count(SourceLabel.DEAD_RECKONED),

@@ -168,7 +168,8 @@ def _of_file(
     lost = unusable_sightings(views)
     if lost:
         typer.echo(f"{matches}: {lost} sightings of views with given poses are not finite, and left out", err=True)
-    rows = list(solve_views(views, budget, every))
+    with_points = arcs is not None and any(arc.options.get("solve_landmarks") for arc in told.arcs)
+    rows = list(solve_views(views, budget, every, with_points))
     if bundle:
         rows = bundle_views(views, rows, given_sigma_km, 1e-3 * given_sigma_mrad)
     failed = [row for row in rows if isinstance(row.answer, PnpFailureError)]
@@ -185,7 +186,7 @@ def _of_file(
 def _smooth(target: Path, told: "Cameras", rows: "list[PoseRow]", cluster: ClusterOptions) -> None:
     """Smooth a file's arcs into a folder."""
     from workflows.execute import map_in_order
-    from workflows.pose_arcs import ArcJobOfFile, solve_arc_of_file, table_of, timing_rows
+    from workflows.pose_arcs import POINT_SCHEMA, ArcJobOfFile, solve_arc_of_file, table_of, timing_rows
 
     jobs = [ArcJobOfFile.of(arc, rows, told.calibration) for arc in told.arcs]
     found = list(map_in_order(solve_arc_of_file, jobs, cluster if len(jobs) > 1 else ClusterOptions(0)))
@@ -196,6 +197,14 @@ def _smooth(target: Path, told: "Cameras", rows: "list[PoseRow]", cluster: Clust
     _write(target / "poses.parquet", table_of([row for arc in smoothed for row in arc.poses], SCHEMAS["poses"]))
     _write(target / "arcs.parquet", table_of([arc.summary for arc in smoothed], SCHEMAS["arcs"]))
     _write(target / "timings.parquet", table_of(timing_rows(rows), SCHEMAS["timings"]))
+    points = [row for arc in smoothed for row in arc.points]
+    if points:
+        _write(target / "points.parquet", table_of(points, POINT_SCHEMA))
+    else:
+        (target / "points.parquet").unlink(missing_ok=True)
+    for job, arc in zip(jobs, smoothed, strict=True):
+        if job.options.solve_landmarks and not arc.points:
+            typer.echo(f"arc {job.identity.arc_id}: no two of its images see a point of uncertain place", err=True)
 
 
 def _compare(views: "Views", rows: "list[PoseRow]") -> None:

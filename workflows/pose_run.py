@@ -18,8 +18,9 @@ from pipeline.camera import pixel_scale_rad
 from pipeline.curate import Json
 from pipeline.errors import ConfigurationError
 from pipeline.pose.arc_factors import ArcImage
+from pipeline.pose.arc_landmarks import PointSightings, sightings_of
 from pipeline.pose.arcs import ArcOptions, fitted_options
-from pipeline.pose.estimator import OpenCVGtsamPoseEstimator
+from pipeline.pose.estimator import OpenCVGtsamPoseEstimator, PoseOptions
 from pipeline.pose.records import (
     CovarianceDegradedWarning,
     MatchError,
@@ -224,7 +225,10 @@ def solve_arc(job: ArcJob) -> ArcAnswer:
         answer = _solved(estimator, image, job.options.budget, started)
         members.append(
             ArcMember(
-                ArcImage(image_id, image.et, image.prior, fix_of(answer), image.offset), answer, image.calibration
+                ArcImage(
+                    image_id, image.et, image.prior, fix_of(answer), image.offset, _sightings(job, image, answer)
+                ),
+                answer, image.calibration,
             )
         )
         timings.append({
@@ -234,6 +238,15 @@ def solve_arc(job: ArcJob) -> ArcAnswer:
     options = fitted_options([member.image for member in members], believed or job.options.arc)
     smoothed = smooth_members(job.identity, members, options) if members else None
     return ArcAnswer(smoothed, timings, tuple(troubles))
+
+
+def _sightings(
+    job: ArcJob, image: DocumentedImage, answer: PoseEstimate | PnpFailureError | None
+) -> PointSightings | None:
+    """What an image's pose rests on, where points are solved too."""
+    if not job.options.arc.solve_landmarks or image.matches is None or not isinstance(answer, PoseEstimate):
+        return None
+    return sightings_of(image.matches, answer, image.calibration, PoseOptions().assumed_sigma_px)
 
 
 def _believed(image: DocumentedImage, told: ArcOptions) -> ArcOptions:

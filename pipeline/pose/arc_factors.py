@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
+from pipeline.pose.arc_landmarks import PointSightings
 from pipeline.pose.graph import pose_key
 from pipeline.pose.records import MatchError, Pose, PosePrior, check_covariances
 from pipeline.pose.se3 import SE3Utils
@@ -84,6 +85,8 @@ class ArcImage(Record):
         Pose from landmarks, if any, with its covariance.
     offset
         What an offset measured, if any: stars an attitude, a body a direction.
+    sightings
+        What the fix rests on, if its points are to be solved as well.
     """
 
     image_id: str
@@ -91,6 +94,7 @@ class ArcImage(Record):
     prior: Pose
     fix: PosePrior | None = None
     offset: AttitudeFix | DirectionFix | None = None
+    sightings: PointSightings | None = None
 
     def __post_init__(self) -> None:
         if not np.isfinite(self.et):

@@ -26,7 +26,8 @@ from pipeline.pose.arc_factors import (
     offset_residual,
     step_factor,
 )
-from pipeline.pose.graph import pose_key
+from pipeline.pose.arc_landmarks import ArcLandmarks, common_landmarks
+from pipeline.pose.graph import covariances_of, point_key, pose_key
 from pipeline.pose.records import MatchError, Pose, PosePrior, SourceLabel
 from pipeline.pose.se3 import SE3Utils
 from pipeline.records import BoolArray, FloatArray, Record
@@ -41,6 +42,8 @@ _BISECTIONS = 40
 _FIX, _OFFSET = 0, 1
 # Fixes taken back settle at once or in two or three rounds.
 _MOST_ROUNDS = 5
+# What a segment hands on is linear: from where the first round ends, two leave a hundredth of a sigma.
+_LANDMARK_ROUNDS = 2
 # Kilometres and radians: a stale linearisation by an angle a misplaces a range by half its square.
 _RELINEARIZE = 1e-5
 
@@ -55,6 +58,8 @@ class ArcOptions(Options):
     twist_sigma_rad: float = Field(1e-3, gt=0, description="1 sigma of the camera's common twist, rad")
     segment: int = Field(250, ge=2, le=100_000, description="images solved at once")
     outlier_chance: float = Field(1e-4, gt=0, lt=0.5, description="of a good fix to be left out")
+    solve_landmarks: bool = Field(False, description="solve places of points that several images see with the poses")
+    most_common_landmarks: int = Field(300, ge=0, le=3000, description="of them, between two segments")
 
     def noise(self) -> ArcNoise:
         """The uncertainties alone."""
@@ -143,6 +148,8 @@ class ArcResult(Record):
         (3,) boresight about x and y, twist about z.
     bias_covariance_rad2
         (3, 3).
+    landmarks
+        Points that were solved with the poses, with their places afterwards; None where none were.
     """
 
     image_id: tuple[str, ...]
@@ -155,6 +162,7 @@ class ArcResult(Record):
     anchor_age_ms: tuple[int | None, ...]
     bias_rad: FloatArray
     bias_covariance_rad2: FloatArray
+    landmarks: ArcLandmarks | None = None
 
     def __post_init__(self) -> None:
         n = len(self.image_id)
@@ -214,12 +222,27 @@ def smooth_arc(images: Sequence[ArcImage], options: ArcOptions | None = None) ->
     o = options or ArcOptions()
     starts = list(range(0, len(images), o.segment))
     segments = [_Segment(k, min(k + o.segment, len(images)), images, o) for k in starts]
-    # Forward: which fixes hold, and what each segment hands on to its right.
     used = np.zeros((len(images), 2), dtype=bool)
-    lefts = [_Handed(first_factors(images[0], o.noise()), gtsam.Values())]
+    result = _sweep(segments, used)
+    if not o.solve_landmarks:
+        return result
+    # Which fixes hold is known now, and where the poses are: now with the points, linearised at what was found before.
+    landmarks = common_landmarks(images, used[:, _FIX], o.segment, o.most_common_landmarks)
+    if not len(landmarks.point_id):
+        return result
+    for _ in range(_LANDMARK_ROUNDS if len(segments) > 1 else 1):
+        result = _sweep([replace(s, landmarks=landmarks, near=result) for s in segments], used)
+    return result
+
+
+def _sweep(segments: "list[_Segment]", used: BoolArray) -> ArcResult:
+    """Forward and back through an arc; sets ``used`` unless an earlier result says where the poses are."""
+    images, noise = segments[0].images, segments[0].options.noise()
+    # Forward: which fixes hold, and what each segment hands on to its right.
+    lefts = [_Handed(first_factors(images[0], noise), gtsam.Values())]
     points: list[gtsam.Values] = []
     for segment in segments:
-        values = segment.settle(lefts[-1], used)
+        values = segment.settle(lefts[-1], used) if segment.near is None else segment.values_near(segment.near)
         points.append(values)
         if segment.stop < len(images):
             lefts.append(segment.hand_on(lefts[-1], values, used, segment.stop - 1))
@@ -230,7 +253,7 @@ def smooth_arc(images: Sequence[ArcImage], options: ArcOptions | None = None) ->
         parts.append(segment.answer(left, right, values, used))
         if segment.start:
             right = segment.hand_on(right, values, used, segment.start - 1, leftward=True)
-    return _result(images, parts[::-1], used)
+    return _result(images, parts[::-1], used, segments[0].landmarks)
 
 
 @dataclass(frozen=True)
@@ -250,30 +273,54 @@ class _Part:
     covariances: list[FloatArray]
     bias: FloatArray
     bias_covariance: FloatArray
+    points: dict[int, tuple[FloatArray, FloatArray]]
 
 
 @dataclass(frozen=True)
 class _Segment:
-    """Images start to stop of an arc; with the last of the segment before, where the step into it begins."""
+    """Images start to stop of an arc; with the last of the segment before, where the step into it begins.
+
+    With landmarks, sightings take the place of the fixes that were made from them, and ``near`` is an earlier result.
+    """
 
     start: int
     stop: int
     images: Sequence[ArcImage]
     options: ArcOptions
+    landmarks: ArcLandmarks | None = None
+    near: ArcResult | None = None
 
     def graph(self, used: BoolArray, robust: gtsam.noiseModel.mEstimator.Base | None) -> gtsam.NonlinearFactorGraph:
         """Factors of the images and of the steps into them; without a weight function, only fixes that are used."""
         noise, graph = self.options.noise(), gtsam.NonlinearFactorGraph()
         for k in range(self.start, self.stop):
-            image = self.images[k]
+            image, seen = self.images[k], None
             if robust is None:
+                seen = image.sightings if self.landmarks is not None and used[k, _FIX] else None
                 image = replace(
-                    image, fix=image.fix if used[k, _FIX] else None, offset=image.offset if used[k, _OFFSET] else None
-                )
+                    image, fix=image.fix if used[k, _FIX] and seen is None else None,
+                    offset=image.offset if used[k, _OFFSET] else None,
+                )  # fmt: skip
             graph.push_back(image_factors(k, image, noise, robust))
+            if self.landmarks is not None and self.near is not None and seen is not None:
+                graph.push_back(self.landmarks.image_factors(k, seen, self.near.pose(k)))
             if k:
                 graph.add(step_factor(k - 1, self.images[k - 1], self.images[k], noise))
+        if self.landmarks is not None:
+            graph.push_back(self.landmarks.prior_factors(self.landmarks.begun_within(self.start, self.stop)))
         return graph
+
+    def values_near(self, near: ArcResult) -> gtsam.Values:
+        """Values of an earlier result."""
+        values = gtsam.Values()
+        values.insert(BIAS_KEY, near.bias_rad)
+        for k in range(max(self.start - 1, 0), self.stop):
+            values.insert(pose_key(k), SE3Utils.to_gtsam(near.pose(k)))
+        if self.landmarks is not None:
+            at = self.landmarks if near.landmarks is None else near.landmarks
+            for point in self.landmarks.seen_within(self.start, self.stop):
+                values.insert(point_key(int(point)), at.places_km[point])
+        return values
 
     def settle(self, left: _Handed, used: BoolArray) -> gtsam.Values:
         """Solve with what lies to the left, robustly; sets ``used`` (fix, offset) for the segment's images."""
@@ -337,20 +384,30 @@ class _Segment:
         graph = self.graph(used, None)
         graph.push_back(beyond.graph)
         linear = graph.linearize(values)
-        kept = {pose_key(keep), BIAS_KEY}
+        common, within = self._landmarks_at(self.start if leftward else self.stop)
+        kept = {pose_key(keep), BIAS_KEY, *common}
         order = range(self.stop - 1, self.start - 1, -1) if leftward else range(max(self.start - 1, 0), self.stop)
         ordering = gtsam.Ordering()
-        for k in order:
-            if pose_key(k) not in kept:
-                ordering.push_back(pose_key(k))
+        for key in [*(pose_key(k) for k in order), *within]:
+            if key not in kept:
+                ordering.push_back(key)
         _, rest = linear.eliminatePartialSequential(ordering)
         at = gtsam.Values()
         at.insert(BIAS_KEY, values.atVector(BIAS_KEY))
         at.insert(pose_key(keep), values.atPose3(pose_key(keep)))
+        for key in common:
+            at.insert(key, values.atPoint3(key))
         handed = gtsam.NonlinearFactorGraph()
         for i in range(rest.size()):
             handed.add(gtsam.LinearContainerFactor(rest.at(i), at))
         return _Handed(handed, at)
+
+    def _landmarks_at(self, boundary: int) -> tuple[list[int], list[int]]:
+        """Keys of the points that both sides of a boundary see, and of all that play a part in this segment."""
+        if self.landmarks is None:
+            return [], []
+        common, within = self.landmarks.crossing(boundary), self.landmarks.seen_within(self.start, self.stop)
+        return [point_key(int(k)) for k in common], [point_key(int(k)) for k in within]
 
     def answer(self, left: _Handed, right: _Handed, values: gtsam.Values, used: BoolArray) -> _Part:
         """Poses and covariances between what lies to the left and to the right."""
@@ -358,15 +415,29 @@ class _Segment:
         graph.push_back(left.graph)
         graph.push_back(right.graph)
         values = _optimize(graph, values)
-        marginals = gtsam.Marginals(graph, values)
-        part = _Part([], [], [], values.atVector(BIAS_KEY), marginals.marginalCovariance(BIAS_KEY))
+        spread = self._covariances(graph, values)
+        part = _Part([], [], [], values.atVector(BIAS_KEY), spread[BIAS_KEY], {})
         for k in range(self.start, self.stop):
             pose = SE3Utils.from_gtsam(values.atPose3(pose_key(k)))
-            covariance = marginals.marginalCovariance(pose_key(k))
             part.turns.append(pose.camera_from_body)
             part.places.append(pose.position_km)
-            part.covariances.append(SE3Utils.error_from_gtsam(covariance, pose.camera_from_body))
+            part.covariances.append(SE3Utils.error_from_gtsam(spread[pose_key(k)], pose.camera_from_body))
+        if self.landmarks is not None:
+            for k in self.landmarks.begun_within(self.start, self.stop):
+                key = point_key(int(k))
+                part.points[int(k)] = values.atPoint3(key), spread[key]
         return part
+
+    def _covariances(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> dict[int, FloatArray]:
+        """Of all variables of a segment, in GTSAM's tangent."""
+        poses = [pose_key(k) for k in range(max(self.start - 1, 0), self.stop)]
+        if self.landmarks is None:
+            marginals = gtsam.Marginals(graph, values)
+            return {key: marginals.marginalCovariance(key) for key in [BIAS_KEY, *poses]}
+        within = self._landmarks_at(self.start)[1]
+        common = {*self._landmarks_at(self.start)[0], *self._landmarks_at(self.stop)[0]}
+        leaves = [key for key in within if key not in common]
+        return covariances_of(graph, values, leaves, [*poses, BIAS_KEY, *sorted(common)])
 
 
 def _optimize(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.Values:
@@ -385,12 +456,21 @@ def _fix_distance2(fix: PosePrior, pose: gtsam.Pose3, covariance: FloatArray | N
     return float(away @ np.linalg.solve(total, away))
 
 
-def _result(images: Sequence[ArcImage], parts: list[_Part], used: BoolArray) -> ArcResult:
+def _result(
+    images: Sequence[ArcImage], parts: list[_Part], used: BoolArray, landmarks: ArcLandmarks | None
+) -> ArcResult:
     label, age = labels_of([image.et for image in images], used[:, _FIX])
+    if landmarks is not None:
+        points = {k: point for part in parts for k, point in part.points.items()}
+        order = range(len(landmarks.point_id))
+        landmarks = replace(
+            landmarks, places_km=np.array([points[k][0] for k in order]),
+            covariance_km2=np.array([points[k][1] for k in order]),
+        )  # fmt: skip
     return ArcResult(
         tuple(image.image_id for image in images), np.array([t for p in parts for t in p.turns]),
         np.array([x for p in parts for x in p.places]), np.array([c for p in parts for c in p.covariances]),
-        used[:, _FIX], used[:, _OFFSET], label, age, parts[0].bias, parts[0].bias_covariance,
+        used[:, _FIX], used[:, _OFFSET], label, age, parts[0].bias, parts[0].bias_covariance, landmarks,
     )  # fmt: skip
 
 

@@ -1,9 +1,11 @@
 """Factors of GTSAM: one image's matches on its pose, with the points' own uncertainty."""
 
+from collections.abc import Sequence
 from typing import Protocol
 
 import gtsam
 import numpy as np
+from scipy.linalg import cho_factor, cho_solve
 
 from pipeline.pose.records import Pose
 from pipeline.pose.refine import scene_scale, whitening
@@ -188,3 +190,58 @@ def posterior(
     unit = np.array([scale, scale, scale, 1.0, 1.0, 1.0])
     errors = SE3Utils.error_from_gtsam(marginal, found.camera_from_body) * np.outer(unit, unit)
     return Pose(found.camera_from_body, found.position_km * scale + centre), errors
+
+
+def covariances_of(
+    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, leaves: Sequence[int], others: Sequence[int]
+) -> dict[int, FloatArray]:
+    """Marginal covariances of all variables, where many are leaves: points that see nothing but poses.
+
+    ``Marginals`` asks its tree once per variable, which takes long where a tree's root is large.
+
+    Parameters
+    ----------
+    graph
+        Factors.
+    values
+        Where they are linearised; variables of six, three and three numbers: poses, points, the bias.
+    leaves
+        Keys of variables no two of which share a factor.
+    others
+        All other keys.
+
+    Returns
+    -------
+    dict
+        (k, k) of each key, in GTSAM's tangent.
+    """
+    ordering, rest_order = gtsam.Ordering(), gtsam.Ordering()
+    for key in leaves:
+        ordering.push_back(key)
+    for key in others:
+        rest_order.push_back(key)
+    linear = graph.linearize(values)
+    net, rest = linear.eliminatePartialSequential(ordering) if leaves else (gtsam.GaussianBayesNet(), linear)
+    information = rest.hessian(rest_order)[0]
+    unit = 1.0 / np.sqrt(np.diag(information))
+    factor = cho_factor(information * np.outer(unit, unit), lower=True, overwrite_a=True)
+    joint = cho_solve(factor, np.diag(unit), overwrite_b=True) * unit[:, None]
+    sizes = [_size(key) for key in others]
+    starts = dict(zip(others, np.cumsum([0, *sizes[:-1]]), strict=True))
+    rows = {key: np.arange(starts[key], starts[key] + size) for key, size in zip(others, sizes, strict=True)}
+    found = {key: joint[np.ix_(rows[key], rows[key])] for key in others}
+    for k in range(net.size()):
+        conditional = net.at(k)
+        key, *parents = conditional.keys()
+        inverse = np.linalg.inv(conditional.R())
+        found[key] = inverse @ inverse.T
+        if parents:
+            slope = inverse @ conditional.S()
+            index = np.concatenate([rows[parent] for parent in parents])
+            found[key] = found[key] + slope @ joint[np.ix_(index, index)] @ slope.T
+    return found
+
+
+def _size(key: int) -> int:
+    """Numbers of a variable's tangent, by the letter of its key."""
+    return 6 if gtsam.symbolChr(key) == ord("x") else 3

@@ -76,6 +76,7 @@ ARC_SCHEMA = pa.schema([
     _field("dead_reckoned", _WHOLE, "count", "held by the trajectory alone"),
     _field("outliers", _WHOLE, "count", "raw poses that contradict the arc"),
     _field("offsets_used", _WHOLE, "count", "images whose navigated offset holds them"),
+    _field("landmarks_solved", _WHOLE, "count", "points that several images see, solved with the poses"),
     *[_field(f"bias_{name}_rad", _REAL, "rad", f"common {text} of the camera against its believed attitude")
       for name, text in (("x", "offset about x"), ("y", "offset about y"), ("twist", "twist about z"))],
     *[_field(f"sigma_bias_{name}_rad", _REAL, "rad", "1 sigma") for name in ("x", "y", "twist")],

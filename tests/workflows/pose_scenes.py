@@ -127,8 +127,9 @@ def _landmarks(rng: np.random.Generator, true: Pose, points: np.ndarray) -> dict
     wrong = rng.random(len(places)) < 0.05
     observed[wrong] += rng.uniform(15, 40, (int(wrong.sum()), 2))
     count = len(places)
+    names = [f"L{k}" for k in np.flatnonzero(np.isin(points, places).all(axis=1))]
     columns: dict[str, Json] = {
-        "landmark": [f"L{k}" for k in range(count)], "status": ["found"] * count, "used": [True] * count,
+        "landmark": names, "status": ["found"] * count, "used": [True] * count,
         "observed_v_px": [None, *observed[1:, 0].tolist()], "observed_u_px": observed[:, 1].tolist(),
         "sigma_dv_px": [SIGMA_PX] * count, "sigma_du_px": [SIGMA_PX] * count, "cov_dv_du_px2": [0.0] * count,
     }  # fmt: skip

@@ -10,6 +10,7 @@ import pytest
 from typer.testing import CliRunner
 
 from pipeline.camera import project
+from pipeline.errors import ConfigurationError
 from pipeline.geometry.rotations import matrix_from_quaternion
 from pipeline.pose.normalise import pinhole_camera
 from pipeline.pose.records import Pose
@@ -261,3 +262,38 @@ def test_what_is_not_there_or_no_table_is_one_error(tmp_path: Path) -> None:
     assert "No such file" in str(_run(tmp_path / "none", cameras, tmp_path / "p")[2])
     (tmp_path / "text").write_text("hello")
     assert "no Parquet table" in str(_run(tmp_path / "text", cameras, tmp_path / "p")[2])
+
+
+def test_an_arc_may_solve_its_points(tmp_path: Path) -> None:
+    table, poses, points = _views()
+    rng, sigma = np.random.default_rng(5), 0.05
+    wrong = points + rng.normal(size=points.shape) * sigma
+    table[["x_km", "y_km", "z_km"]] = wrong[table.point_id - 7]
+    for axes in ("xx", "xy", "xz", "yy", "yz", "zz"):
+        table[f"cov_{axes}_km2"] = sigma**2 if axes[0] == axes[1] else 0.0
+    table["cov_vv"] = table["cov_uu"] = 0.25**2
+    table["cov_vu"] = 0.0
+    path, cameras = tmp_path / "m.parquet", _cameras(tmp_path, poses, [])
+    table.to_parquet(path)
+    told = json.loads(cameras.read_text())
+    arc = [
+        {"view_id": 10 * k, "et": 60.0 * k, "position_km": pose.position_km.tolist(),
+         "camera_from_body": pose.camera_from_body.tolist()} for k, pose in enumerate(poses)
+    ]  # fmt: skip
+    told["arcs"] = [{"arc_id": "a", "options": {"solve_landmarks": True, "segment": 4}, "views": arc}]
+    cameras.write_text(json.dumps(told))
+    assert _run(path, cameras, tmp_path / "p.parquet", "--arcs", str(tmp_path / "arcs"))[0] == 0
+    solved = pd.read_parquet(tmp_path / "arcs" / "points.parquet")
+    assert len(solved) == pd.read_parquet(tmp_path / "arcs" / "arcs.parquet").landmarks_solved[0] > 300
+    error = solved[["x_km", "y_km", "z_km"]].to_numpy() - points[solved.point_id - 7]
+    before = wrong[solved.point_id - 7] - points[solved.point_id - 7]
+    assert np.sqrt((error**2).mean()) < 0.9 * np.sqrt((before**2).mean())
+    variance = solved[["cov_xx_km2", "cov_yy_km2", "cov_zz_km2"]].to_numpy()
+    # About a thousand numbers, most of them independent.
+    assert np.mean(error**2 / variance) == pytest.approx(1.0, abs=0.15)
+
+    told["arcs"][0]["options"] = {"solve_landmarks": "perhaps"}
+    cameras.write_text(json.dumps(told))
+    _, _, error_told = _run(path, cameras, tmp_path / "p.parquet", "--arcs", str(tmp_path / "arcs"))
+    assert isinstance(error_told, ConfigurationError)
+    assert "arc a: options.solve_landmarks" in str(error_told)

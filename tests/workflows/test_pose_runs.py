@@ -67,8 +67,9 @@ def test_the_same_bytes_from_one_process_and_from_workers(tmp_path: Path) -> Non
     run = plant_run(tmp_path, cameras=("NAC", "WAC", "X/Y"), count=8)
     digests = []
     for how in (["--serial"], ["--workers", "2"]):
-        code, text = _run(run, *how)
+        code, text = _run(run, *how, "--set", "solve_landmarks=true")
         assert code == 0, text
+        assert (_table(run, "arcs").landmarks_solved > 30).all()
         files = sorted(p for name in ("poses", "arcs") for p in (run.folder.root / name).rglob("*.parquet"))
         assert len(files) == 6
         digests.append([hashlib.sha256(path.read_bytes()).hexdigest() for path in files])

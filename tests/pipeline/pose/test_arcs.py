@@ -17,12 +17,13 @@ from pipeline.pose.arc_factors import (
     direction_factor,
     step_factor,
 )
+from pipeline.pose.arc_landmarks import PointSightings, common_landmarks
 from pipeline.pose.arcs import ArcOptions, ArcResult, GrowingArc, fitted_options, labels_of, smooth_arc
 from pipeline.pose.estimator import OpenCVGtsamPoseEstimator
-from pipeline.pose.graph import pose_key, resection_factor
+from pipeline.pose.graph import covariances_of, match_graph, point_key, pose_key, resection_factor
 from pipeline.pose.records import CameraCalibration, MatchError, MatchResult, Pose, SourceLabel, ThermalState
 from pipeline.pose.se3 import SE3Utils
-from tests.pipeline.pose.arc_scenes import plant_arc
+from tests.pipeline.pose.arc_scenes import plant_arc, plant_sightings
 from tests.pipeline.pose.scenes import CAMERAS, DATUM
 
 OPTIONS = ArcOptions(segment=40)
@@ -241,3 +242,87 @@ def test_uncertainties_that_nobody_told_come_from_the_fixes() -> None:
     assert 2.0 < position < 20.0
     few, _, _ = plant_arc(80, 1, told, gap=0.99)
     assert fitted_options(few, told) is told
+
+
+def _with_points(count: int, seed: int) -> tuple[list[ArcImage], list[Pose], np.ndarray]:
+    images, poses, _ = plant_arc(count, seed, OPTIONS, outliers=0.0)
+    sighted, places = plant_sightings(images, poses, seed)
+    return sighted, poses, places
+
+
+def test_points_that_are_solved_make_covariances_hold_which_common_errors_spoil() -> None:
+    apart, together, points = [], [], []
+    for seed in range(12):
+        images, poses, places = _with_points(16, seed)
+        apart.append(_nees(smooth_arc(images, OPTIONS), poses).mean())
+        result = smooth_arc(images, ArcOptions(segment=40, solve_landmarks=True))
+        together.append(_nees(result, poses).mean())
+        solved = result.landmarks
+        assert solved is not None
+        assert len(solved.point_id) > 40
+        assert solved.sightings.min() >= 2
+        error = solved.places_km - places[solved.point_id - 10]
+        points.append(np.einsum("ni,nij,nj->n", error, np.linalg.inv(solved.covariance_km2), error).mean())
+        # The places were 0.1 km wrong.
+        assert np.sqrt((error**2).mean()) < 0.07
+    # Images of an arc share errors, so each arc is about one draw of chi2 with six degrees of freedom: mean of twelve.
+    assert np.mean(apart) > 12.0
+    assert 3.5 < np.mean(together) < 9.0
+    assert 2.3 < np.mean(points) < 3.7
+
+
+def test_cutting_an_arc_with_points_changes_nothing() -> None:
+    images, _, _ = _with_points(30, 3)
+    whole = smooth_arc(images, ArcOptions(segment=100, solve_landmarks=True))
+    cut = smooth_arc(images, ArcOptions(segment=8, solve_landmarks=True))
+    sigma = np.sqrt(np.diagonal(whole.covariance, axis1=1, axis2=2))
+    assert (np.abs(cut.position_km - whole.position_km) < 0.05 * sigma[:, :3]).all()
+    assert_allclose(np.diagonal(cut.covariance, axis1=1, axis2=2), sigma**2, rtol=0.01)
+    assert whole.landmarks is not None
+    assert cut.landmarks is not None
+    assert cut.landmarks.point_id.tolist() == whole.landmarks.point_id.tolist()
+    assert_allclose(cut.landmarks.places_km, whole.landmarks.places_km, atol=5e-3)
+    assert_allclose(cut.landmarks.covariance_km2, whole.landmarks.covariance_km2, atol=2e-5)
+
+
+def test_points_between_segments_are_bounded_and_those_with_most_sightings_stay() -> None:
+    images, _, _ = _with_points(30, 3)
+    used = np.array([image.fix is not None for image in images])
+    every, few = (common_landmarks(images, used, 8, most) for most in (1000, 5))
+    for boundary in (8, 16, 24):
+        assert len(every.crossing(boundary)) > 5 >= len(few.crossing(boundary))
+    best = every.point_id[np.argmax(every.sightings)]
+    assert best in few.point_id
+    result = smooth_arc(images, ArcOptions(segment=8, solve_landmarks=True, most_common_landmarks=5))
+    assert result.landmarks is not None
+    assert result.landmarks.point_id.tolist() == few.point_id.tolist()
+
+
+def test_places_that_images_state_apart_are_different_points() -> None:
+    def seen(place: float) -> PointSightings:
+        return PointSightings(
+            np.array([4]), np.zeros((1, 2)), np.eye(2)[None] * 1e-6, np.full((1, 3), place), np.eye(3)[None]
+        )
+
+    image = ArcImage("a", 0.0, Pose(np.eye(3), np.zeros(3)))
+    images = [replace(image, sightings=seen(place)) for place in (0.0, 0.0, 3.0)]
+    points = common_landmarks(images, np.ones(3, dtype=bool), 10, 10)
+    sizes = [points.image_factors(k, seen(place), Pose(np.eye(3), np.array([0, 0, -9.0]))) for k, place in
+             enumerate((0.0, 3.0))]  # fmt: skip
+    assert [list(graph.at(0).keys()) for graph in sizes] == [[pose_key(0), point_key(0)], [pose_key(1)]]
+
+
+def test_covariances_at_once_are_those_of_the_tree() -> None:
+    rng = np.random.default_rng(0)
+    places = rng.normal(size=(20, 3)) + np.array([0.0, 0.0, 9.0])
+    spread = np.tile(np.eye(3) * 1e-3, (20, 1, 1))
+    noise = np.tile(np.eye(2) * 1e-6, (20, 1, 1))
+    graph, values = match_graph(pose_key(0), places, places[:, :2] / places[:, 2:], noise, spread)
+    values.insert(pose_key(0), gtsam.Pose3())
+    tree = gtsam.Marginals(graph, values)
+    found = covariances_of(graph, values, [point_key(k) for k in range(15)],
+                           [pose_key(0), *(point_key(k) for k in range(15, 20))])  # fmt: skip
+    assert len(found) == 21
+    for key, covariance in found.items():
+        expected = tree.marginalCovariance(key)
+        assert_allclose(covariance, expected, atol=1e-6 * np.abs(expected).max())
