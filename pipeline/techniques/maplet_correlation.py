@@ -55,7 +55,7 @@ class CorrelationOptions(Options):
 
     bin_start: int = Field(1, ge=1, le=24, description="5 bins of this size to each side are searched first")
     every_bin: bool = Field(
-        False, description="go down by one bin at a time as SPC does; else by halves, after one wide search at a small bin"
+        False, description="one bin after the other as in SPC; else by halves, after one wide search in small bins"
     )
     subpixel: Literal["quadratic", "taylor"] = Field("quadratic", description="fit of the peak, over 3 x 3 or per axis")
     least_correlation: float = Field(0.35, ge=-1, le=1, description="correlation below which nothing was found")
