@@ -286,8 +286,8 @@ def _landmarks(table: LandmarkTable) -> dict[str, Json]:
     """Columns of the landmarks: predicted, observed, and what was in between."""
     offset, covariance = table.observed_vu - table.predicted_vu, table.covariance_px2
     columns: dict[str, Json] = {
-        "landmark": table.name.tolist(), "status": table.status.tolist(), "used": table.used.tolist(),
-        "bin": table.bin_size.tolist(),
+        "landmark": table.name.tolist(), "status": table.status.tolist(), "reason": table.reason.tolist(),
+        "used": table.used.tolist(), "bin": table.bin_size.tolist(),
     }  # fmt: skip
     reals = {
         "predicted_v_px": table.predicted_vu[:, 0], "predicted_u_px": table.predicted_vu[:, 1],
@@ -296,6 +296,7 @@ def _landmarks(table: LandmarkTable) -> dict[str, Json]:
         "sigma_dv_px": np.sqrt(covariance[:, 0, 0]), "sigma_du_px": np.sqrt(covariance[:, 1, 1]),
         "cov_dv_du_px2": covariance[:, 0, 1], "correlation": table.correlation, "incidence_deg": table.incidence_deg,
         "emission_deg": table.emission_deg, "cells_per_pixel": table.ratio,
+        "illuminated_share": table.illuminated, "removed_share": table.removed,
     }  # fmt: skip
     for name, values in reals.items():
         columns[name] = _numbers(values, _PIXEL_DIGITS + 1)

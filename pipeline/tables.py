@@ -117,8 +117,9 @@ SCHEMAS: dict[str, pa.Schema] = {
     "landmarks": pa.schema([
         *_IDENTITY,
         _field("landmark", _TEXT, "", "name in the maplet catalogue"),
-        _field("status", _TEXT, "", "found, or why not: a correlation's end or a criterion of removal"),
-        _field("used", _FLAG, "", "took part in the fit"),
+        _field("status", _TEXT, "", "found, not_found or removed"),
+        _field("reason", _TEXT, "", "how the correlation ended, or the criterion of removal; empty where found"),
+        _field("used", _FLAG, "", "took part in the fit of the state, or where there is none in that of the pointing"),
         _field("predicted_v_px", _REAL, _PIXEL, "under the a-priori geometry"),
         _field("predicted_u_px", _REAL, _PIXEL, "under the a-priori geometry"),
         _field("observed_v_px", _REAL, _PIXEL, "null where not found"),
@@ -133,6 +134,8 @@ SCHEMAS: dict[str, pa.Schema] = {
         _field("incidence_deg", _REAL, "deg", "Sun from the maplet's mean normal"),
         _field("emission_deg", _REAL, "deg", "camera from the maplet's mean normal"),
         _field("cells_per_pixel", _REAL, "", "resolution ratio: above 1 the maplet is finer than the picture"),
+        _field("illuminated_share", _REAL, "", "lit share of the predicted image"),
+        _field("removed_share", _REAL, "", "share of the extracted image that the filter took out"),
         _field("x_km", _REAL, "km", "landmark, body-fixed"),
         _field("y_km", _REAL, "km", "landmark, body-fixed"),
         _field("z_km", _REAL, "km", "landmark, body-fixed"),
@@ -339,5 +342,6 @@ def block_columns(documents: Iterable[Mapping[str, Json]], table: str) -> dict[s
             continue
         count = len(block[next(iter(block))])  # type: ignore[arg-type]
         for name, values in columns.items():
-            values.extend(block[name] if name in block else [document[name]] * count)  # type: ignore[arg-type]
+            # A document of an older version lacks columns.
+            values.extend(block[name] if name in block else [document.get(name)] * count)  # type: ignore[arg-type]
     return columns

@@ -87,6 +87,7 @@ _NULLS: dict[str, dict[tuple[str, ...], str]] = {
         ("observed_v_px", "observed_u_px", "offset_dv_px", "offset_du_px", "sigma_dv_px", "sigma_du_px",
          "cov_dv_du_px2", "correlation", "bin"): _NOT_FOUND,
         ("incidence_deg", "emission_deg", "cells_per_pixel"): "removed before it was known",
+        ("reason", "illuminated_share", "removed_share"): "written by an older version",
         ("cov_xx_km2", "cov_xy_km2", "cov_xz_km2", "cov_yy_km2", "cov_yz_km2", "cov_zz_km2"): (
             "the catalogue does not say"
         ),

@@ -1,11 +1,20 @@
 """Landmarks of one picture: what was predicted, what was found, and the 2-D to 3-D matches for the pose."""
 
 from dataclasses import dataclass
+from enum import StrEnum
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.records import BoolArray, FloatArray, Record
+
+
+class LandmarkStatus(StrEnum):
+    """What became of a landmark that was looked for."""
+
+    FOUND = "found"
+    NOT_FOUND = "not_found"
+    REMOVED = "removed"
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,10 +41,14 @@ class LandmarkTable(Record):
         (n,) of the maplet's mean surface.
     ratio
         (n,) cells per pixel.
+    illuminated, removed
+        (n,) lit share of the predicted image (seed 001 eq. 3.55) and removed share of the extracted one (eq. 3.53).
     used
-        (n,) took part in the fit.
+        (n,) took part in the fit of the state, or where there is none in that of the pointing.
     status
-        (n,) found, or why not.
+        (n,) see :class:`LandmarkStatus`.
+    reason
+        (n,) how the correlation ended, or the criterion of removal; empty where found.
     """
 
     name: NDArray[np.str_]
@@ -49,8 +62,11 @@ class LandmarkTable(Record):
     incidence_deg: FloatArray
     emission_deg: FloatArray
     ratio: FloatArray
+    illuminated: FloatArray
+    removed: FloatArray
     used: BoolArray
     status: NDArray[np.str_]
+    reason: NDArray[np.str_]
 
     def __post_init__(self) -> None:
         n = len(self.name)

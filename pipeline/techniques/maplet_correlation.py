@@ -431,7 +431,7 @@ def _far_peak(images: MapletImages, size: int, share: float) -> Peak:
         return _nothing(PeakStatus.NO_VARIATION, 0.0)
     if not stands_alone(surface, place, share):
         return _nothing(PeakStatus.AMBIGUOUS, height)
-    shift = (place - len(surface) // 2) * float(size)
+    shift = np.asarray((place - len(surface) // 2) * size, float)
     return Peak(PeakStatus.FOUND, shift, np.full((2, 2), np.nan), height, int(predicted[1].sum()))
 
 

@@ -124,7 +124,7 @@ def unresolved_shift(maplet: Maplet, prepared: PreparedMaplet, options: MapletIm
         maplet, scale_km=2.0 * maplet.scale_km, heights=_halved(maplet.heights[cut, cut]) / 2.0,
         albedo=_halved(maplet.albedo[cut, cut]),
     )  # fmt: skip
-    lit = prepared.lit[cut, cut].reshape(side, 2, side, 2).all(axis=(1, 3))
+    lit = np.asarray(prepared.lit[cut, cut].reshape(side, 2, side, 2).all(axis=(1, 3)), bool)
     fine = np.where(lit, _halved(prepared.predicted[cut, cut]), 0.0)
     predicted = predict_image(coarse, prepared.sun, prepared.ray, options)
     shift, _, cells = regressed_shift(predicted, (fine, lit), np.zeros(2, np.int64))

@@ -18,13 +18,13 @@ from pipeline.geometry.maplet import Maplet, MapletIndex, MapletView
 from pipeline.geometry.pointing import corrected_attitude, move_pivot
 from pipeline.geometry.rays import RayTree
 from pipeline.imaging.maplet_images import MapletImageOptions
-from pipeline.predict.maplet_removal import RemovalOptions, removal_reason
+from pipeline.predict.maplet_removal import RemovalOptions, removal_reason, removed_ratio
 from pipeline.predict.maplets import CullingOptions, MapletReason, Visibility, cull, maplet_jacobian, view_of
 from pipeline.records import Body, BoolArray, FloatArray, Image, State
 from pipeline.status import StatusReason
 from pipeline.techniques.base import NavContext, TechniqueFailure, TechniqueOptions, TechniqueResult, edge_flags
 from pipeline.techniques.landmark_state import LandmarkState, LandmarkStateOptions, update_state
-from pipeline.techniques.landmark_table import LandmarkTable
+from pipeline.techniques.landmark_table import LandmarkStatus, LandmarkTable
 from pipeline.techniques.maplet_alignment import Alignment, align, light_of
 from pipeline.techniques.maplet_correlation import REACH, CorrelationOptions, LandmarkMatch, PeakStatus, locate
 from pipeline.techniques.star_fit import StarFit, StarFitOptions, fit_stars
@@ -158,7 +158,8 @@ def surface_feature_nav(
     if isinstance(answer, TechniqueFailure):
         return SurfaceFix(answer, table)
     prior = _prior_covariance(view, search, state.attitude.sigma_rad)
-    return SurfaceFix(answer, table, _state(search, view, replace(view, camera_from_body=attitude), table, prior))
+    found, table = _state(search, view, replace(view, camera_from_body=attitude), table, prior)
+    return SurfaceFix(answer, table, found)
 
 
 def _chosen(seen: Visibility, most: int) -> NDArray[np.int64]:
@@ -219,10 +220,10 @@ def _prior_covariance(view: MapletView, search: _Search, sigma_rad: FloatArray |
 
 def _state(
     search: _Search, before: MapletView, start: MapletView, table: LandmarkTable, prior: FloatArray
-) -> LandmarkState | None:
-    """Position and attitude, landmarks looked for again until the state leaves them in place."""
-    options, found_state, places = search.options, None, start.pixels(table.landmark_km)[0]
-    for _ in range(options.state_rounds):
+) -> tuple[LandmarkState | None, LandmarkTable]:
+    """Position and attitude, landmarks looked for again until the state leaves them in place; and their last search."""
+    options, places, last = search.options, start.pixels(table.landmark_km)[0], table
+    for number in range(1, options.state_rounds + 1):
         found = np.flatnonzero(table.found)
         matches = (
             table.landmark_km[found], table.landmark_covariance_km2[found], table.observed_vu[found],
@@ -230,12 +231,14 @@ def _state(
         )  # fmt: skip
         updated = update_state(before, matches, prior, options.state)
         if isinstance(updated, str):
-            return None
-        found_state, moved = updated, updated.view.pixels(table.landmark_km)[0]
-        if np.abs(moved - places).max() < options.state_tolerance_px:
-            break
+            return None, last
+        used = np.zeros(len(table), bool)
+        used[found[updated.used]] = True
+        moved = updated.view.pixels(table.landmark_km)[0]
+        if np.abs(moved - places).max() < options.state_tolerance_px or number == options.state_rounds:
+            return updated, replace(table, used=used)
         places, table = moved, _looked_for(search, before, updated.view, (0.0, 2))
-    return found_state
+    return None, last
 
 
 def _looked_for(search: _Search, before: MapletView, view: MapletView, reach: tuple[float, int]) -> LandmarkTable:
@@ -248,21 +251,22 @@ def _looked_for(search: _Search, before: MapletView, view: MapletView, reach: tu
     predicted, now = before.pixels(index.landmark_km[rows])[0], view.pixels(index.landmark_km[rows])[0]
     observed, covariance = np.full((len(rows), 2), np.nan), np.full((len(rows), 2, 2), np.nan)
     correlation, size = np.full(len(rows), np.nan), np.zeros(len(rows), np.int64)
-    status = []
+    shares, ends = np.zeros((len(rows), 2)), []
     ratio = 1.0 / np.sqrt(np.abs(np.linalg.det(jacobians)))
     for k, maplet in enumerate(search.maplets):
-        match, reason = _match(search, view, maplet, jacobians[k], float(ratio[k]), reach)
-        status.append(reason)
+        match, status, reason = _match(search, view, maplet, jacobians[k], float(ratio[k]), reach)
+        ends.append((status.value, reason))
         correlation[k], size[k] = match.correlation, match.bin
-        if reason == PeakStatus.FOUND.value:
+        shares[k] = match.images.illuminated, removed_ratio(match.images)
+        if status is LandmarkStatus.FOUND:
             observed[k], covariance[k] = now[k] + match.offset_vu, match.covariance_px2
     normal = index.maplet_from_body[rows, 2]
     sight = before.position_km - index.landmark_km[rows]
     emission = (normal * sight).sum(axis=1) / np.linalg.norm(sight, axis=1)
     return LandmarkTable(
         index.name[rows], index.landmark_km[rows], index.covariance_km2[rows], predicted, observed, covariance,
-        correlation, size, _degrees(normal @ view.sun), _degrees(emission), ratio, np.zeros(len(rows), bool),
-        np.array(status),
+        correlation, size, _degrees(normal @ view.sun), _degrees(emission), ratio, shares[:, 0],
+        shares[:, 1], np.zeros(len(rows), bool), *np.array(ends).T,
     )  # fmt: skip
 
 
@@ -272,7 +276,7 @@ def _degrees(cosine: FloatArray) -> FloatArray:
 
 def _match(
     search: _Search, view: MapletView, maplet: Maplet, jacobian: FloatArray, ratio: float, reach: tuple[float, int]
-) -> tuple[LandmarkMatch, str]:
+) -> tuple[LandmarkMatch, LandmarkStatus, str]:
     options = search.options
     size = max(1, int(np.ceil(reach[0] * ratio / _USABLE_BINS)))
     # Where the others lie tells a wrong peak better than its rivals do.
@@ -280,7 +284,11 @@ def _match(
     correlation = options.correlation.model_copy(update=update)
     match = locate(view, maplet, search.picture, jacobian, np.zeros(2), (options.images, correlation))
     reason = removal_reason(match.images, ratio, maplet.name, options.removed_by_hand, options.removal)
-    return match, match.status.value if reason is MapletReason.USED else reason.name.lower()
+    if reason is not MapletReason.USED:
+        return match, LandmarkStatus.REMOVED, reason.name.lower()
+    if match.status is not PeakStatus.FOUND:
+        return match, LandmarkStatus.NOT_FOUND, match.status.value
+    return match, LandmarkStatus.FOUND, ""
 
 
 def _fit(

@@ -54,7 +54,7 @@ def test_landmarks_are_found_fused_and_written(tmp_path: Path) -> None:
     ).fetchall()
     assert len(rows) == landmarks["diagnostics"]["landmarks_looked_for"]
     found = [row for row in rows if row[0] == "found"]
-    assert sum(row[1] for row in rows) == landmarks["diagnostics"]["landmarks_used"]
+    assert sum(row[1] for row in rows) == state["landmarks_used"]
     assert all(row[2] == pytest.approx(row[3], abs=1e-4) and row[4] > 0 and row[5] > 0.3 for row in found)
     assert all(row[2] is None for row in rows if row[0] != "found")
     table = f"read_parquet('{tmp_path}/run/poses/**/*.parquet')"
