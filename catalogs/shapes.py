@@ -110,27 +110,39 @@ def _count(token: bytes) -> int:
 
 def _numbers(rows: Sequence[bytes], columns: int, what: str) -> FloatArray:
     """(n, columns) numbers of rows of equal width."""
+    if not rows:
+        raise ShapeProblem(f"there are no {what} rows")
     tokens = b" ".join(rows).split()
-    if not rows or len(tokens) != len(rows) * columns:
-        raise ShapeProblem(f"{what} rows do not have {columns} columns each")
+    odd = next((k for k, row in enumerate(rows) if len(row.split()) != columns), None)
+    if odd is not None:
+        raise ShapeProblem(f"{what} row {odd + 1} has {len(rows[odd].split())} columns, not {columns}")
     try:
         return np.array(tokens).astype(float).reshape(-1, columns)
     except ValueError as error:
-        raise ShapeProblem(f"{what} rows hold something that is no number") from error
+        odd = next(k for k, row in enumerate(rows) if not _is_numbers(row))
+        raise ShapeProblem(f"{what} row {odd + 1} holds something that is no number") from error
+
+
+def _is_numbers(row: bytes) -> bool:
+    try:
+        np.array(row.split()).astype(float)
+    except ValueError:
+        return False
+    return True
 
 
 def _indices(rows: Sequence[bytes], columns: int) -> IntArray:
     values = _numbers(rows, columns, "facet")
-    if not (np.isfinite(values).all() and (np.abs(values) < 2**53).all() and (values == np.rint(values)).all()):
-        raise ShapeProblem("facet rows hold something that is no index")
+    whole = np.isfinite(values) & (np.abs(values) < 2**53) & (values == np.rint(values))
+    if not whole.all():
+        odd = int(np.flatnonzero(~whole.all(axis=1))[0])
+        raise ShapeProblem(f"facet row {odd + 1} holds something that is no index")
     return values.astype(np.int64)
 
 
 def _obj(lines: Sequence[bytes]) -> tuple[FloatArray, IntArray]:
     """Wavefront OBJ: ``v x y z`` and ``f a b c ...``, indices from 1, or from -1 backwards."""
     places = [line.split(None, 4)[1:4] for line in lines if line.startswith(b"v ")]
-    if any(len(place) != 3 for place in places):
-        raise ShapeProblem("vertex rows do not have 3 columns each")
     vertices = _numbers([b" ".join(place) for place in places], 3, "vertex")
     faces = [line[2:] for line in lines if line.startswith(b"f ")]
     if any(b"/" in face for face in faces):
@@ -247,9 +259,11 @@ def _dsk_plates(handle: int, segment: SpiceDLADescr) -> tuple[FloatArray, IntArr
 
 def _checked(vertices: FloatArray, facets: IntArray) -> TriangleMesh:
     if not np.isfinite(vertices).all() or np.abs(vertices).max() > _LARGEST_KM:
-        raise ShapeProblem(f"a vertex is not finite or beyond {_LARGEST_KM:g} km")
+        odd = np.flatnonzero(~(np.abs(vertices) <= _LARGEST_KM).all(axis=1))[0]
+        raise ShapeProblem(f"vertex {odd + 1} is not finite or beyond {_LARGEST_KM:g} km")
     if facets.min() < 0 or facets.max() >= len(vertices):
-        raise ShapeProblem(f"facets name vertices outside 1 to {len(vertices)}")
+        odd = np.flatnonzero(((facets < 0) | (facets >= len(vertices))).any(axis=1))[0]
+        raise ShapeProblem(f"facet {odd + 1} names a vertex outside 1 to {len(vertices)}")
     a, b, c = (vertices[facets[:, corner]] for corner in range(3))
     facets = facets[(np.cross(b - a, c - a) != 0).any(axis=1)]
     volume = signed_volume(vertices, facets)

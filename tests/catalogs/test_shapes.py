@@ -131,6 +131,15 @@ def test_damage_is_one_line(text: str) -> None:
     failure(text.encode())
 
 
+@pytest.mark.parametrize(
+    ("name", "row"),
+    [("a short vertex", "vertex row 1 has 2 columns"), ("no number", "vertex row 1 holds"), ("not finite", "vertex 1 "),
+     ("vertex 9", "facet 1 names"), ("half a vertex", "facet row 1 holds")],
+)  # fmt: skip
+def test_damage_is_named_by_its_row(name: str, row: str) -> None:
+    assert row in failure(DAMAGED[name].encode())
+
+
 def test_binary_rubbish_is_one_line() -> None:
     failure(bytes(range(256)) * 20)
     failure(b"DAS/DSK " + bytes(5000))
