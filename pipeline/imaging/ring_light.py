@@ -18,6 +18,8 @@ _FAR_SIGMAS = 4.0
 _ROOT2, _ROOT2PI = sqrt(2.0), sqrt(2.0 * pi)
 # Residuals beyond so many sigmas are stars and struck pixels.
 _CLIP_SIGMAS, _LEAST_CLIP = 6.0, 0.7
+# Departure of an edge from a straight line, over twice the fit's reach, up to which its curvature is one number.
+_FLAT_PX = 0.05
 # Distance over which a unit's light changes by one slope.
 _SLOPE_PX = 8.0
 
@@ -197,6 +199,28 @@ def near_edges(  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
+def _curved(slopes, origin, turn, observer, v, u, curve, found, foot, footing, other):  # type: ignore[no-untyped-def]
+    """Distance after a Newton step from :func:`_to_edge`'s, and the edge's curvature: how its normal turns along it."""
+    count = curve.shape[0]
+    s = found[0]
+    if not look(slopes, origin, turn, observer, v - s * found[1], u - s * found[2], foot):
+        return s, 0.0
+    _radial(foot, footing)
+    _angular(foot, count, footing)
+    _to_edge(curve, footing, other)
+    s += other[0]
+    nv, nu = other[1], other[2]
+    if not look(
+        slopes, origin, turn, observer, v - found[0] * found[1] - nu, u - found[0] * found[2] + nv, foot
+    ):
+        return s, 0.0
+    _radial(foot, footing)
+    _angular(foot, count, footing)
+    _to_edge(curve, footing, other)
+    return s, -nu * (other[1] - nv) + nv * (other[2] - nu)
+
+
+@numba.njit(cache=True, nogil=True)
 def measure(  # type: ignore[no-untyped-def]
     slopes, origin, turn, observer, cols, flat, curves, means, spread, cell_of, span, unit_of, unit_edges, reach,
     sigma, forms, sun, unit, distance,
@@ -206,6 +230,10 @@ def measure(  # type: ignore[no-untyped-def]
     polar, footing = np.zeros(6), np.zeros(6)
     count = curves.shape[1]
     bins = cell_of.shape[0]
+    # Second order of the distance and curvature of a unit's edges: one pixel's do for all where they are small.
+    shape = np.zeros((unit_edges.shape[0], MOST_EDGES, 2))
+    flat_enough = np.zeros((unit_edges.shape[0], MOST_EDGES), np.bool_)
+    far2 = 4.0 * reach * reach
     for n in range(flat.shape[0]):
         unit[n] = -1
         v, u = float(flat[n] // cols), float(flat[n] % cols)
@@ -231,29 +259,22 @@ def measure(  # type: ignore[no-untyped-def]
         mine = unit_of[cell, best]
         sound = True
         for k in range(unit_edges[mine, 0], unit_edges[mine, 1]):
+            slot = k - unit_edges[mine, 0]
             _to_edge(curves[k], polar, found)
-            s = found[0]
+            s, bend = found[0], 0.0
             if abs(s) < 2.0 * reach:
-                bend = 0.0
-                if look(slopes, origin, turn, observer, v - s * found[1], u - s * found[2], foot):
-                    _radial(foot, footing)
-                    _angular(foot, count, footing)
-                    _to_edge(curves[k], footing, other)
-                    s += other[0]
-                    nv, nu = other[1], other[2]
-                    # Curvature: how the normal turns along the edge.
-                    if look(
-                        slopes, origin, turn, observer,
-                        v - found[0] * found[1] - nu, u - found[0] * found[2] + nv, foot,
-                    ):  # fmt: skip
-                        _radial(foot, footing)
-                        _angular(foot, count, footing)
-                        _to_edge(curves[k], footing, other)
-                        bend = -nu * (other[1] - nv) + nv * (other[2] - nu)
+                if flat_enough[mine, slot]:
+                    s, bend = s + shape[mine, slot, 0] * s * s, shape[mine, slot, 1]
+                else:
+                    s, bend = _curved(slopes, origin, turn, observer, v, u, curves[k], found, foot, footing, other)
+                    if abs(found[0]) > 1.0:
+                        square = found[0] * found[0]
+                        shape[mine, slot, 0], shape[mine, slot, 1] = (s - found[0]) / square, bend
+                        flat_enough[mine, slot] = max(abs(s - found[0]) / square, abs(bend)) * far2 < _FLAT_PX
                 if abs(bend) * (sigma + abs(found[0])) > 0.5:
                     sound = False
                 s += 0.5 * sigma * sigma * bend
-            distance[n, k - unit_edges[mine, 0]] = s
+            distance[n, slot] = s
         if sound:
             unit[n] = mine
 

@@ -20,6 +20,8 @@ from pipeline.techniques.ring_peaks import Peak, RingSearchOptions, find_peaks
 
 # Error of a peak's place, in pixels, that a comparison of peaks forgives.
 _PEAK_PX = 1.0
+# A peak that leaves over so many times as much as the best one is not fitted.
+_HOPELESS = 8.0
 _SCAN_PX = 12
 _PLACES_ELSEWHERE = 16
 # Places nearer than this to the best one, in pixels across the edges, are the best one.
@@ -113,13 +115,13 @@ def find_rings(
 
 
 def _ranked(scene: RingScene, lattice: Lattice, peaks: list[Peak]) -> list[Peak]:
-    """By what rings of free brightness leave over there, least first."""
+    """By what rings of free brightness leave over there, least first; those that leave by far more are dropped."""
     if len(peaks) == 1:
         return peaks
     left = [
         left_over(scene, lattice, np.array(peak.offset_vu), peak.rotation_rad, _PEAK_PX).mean for peak in peaks
     ]
-    return [peaks[k] for k in np.argsort(left, kind="stable")]
+    return [peaks[k] for k in np.argsort(left, kind="stable") if left[k] <= _HOPELESS * min(left)]
 
 
 def _turned(
