@@ -38,7 +38,8 @@ FOUNDATIONS = {
         "base", "star_fit", "star_match", "star_search", "star_inventory", "body_base", "body_search", "model_errors",
         "template_fit", "body_minor", "contour_fit", "limb_albedo", "lm", "line_search", "relief",
         "ring_units", "ring_solve", "ring_texture", "ring_bands", "ring_fit", "ring_search", "ring_answer",
-        "maplet_correlation", "maplet_alignment", "landmark_table", "landmark_state",
+        "maplet_regression", "maplet_search", "maplet_correlation", "maplet_alignment", "landmark_table",
+        "landmark_state",
     ),
 }  # fmt: skip
 OUTSIDE_OF_SCIENCE = {
@@ -48,7 +49,7 @@ OUTSIDE_OF_SCIENCE = {
 # Schemas are Arrow's, which is not a file.
 ORDER_OF_CATALOGS = (
     "instruments", "label_text", "raw_images", "fits_images", "pds3_images", "gdal_images", "images", "labels",
-    "bodies", "shapes", "geometry", "ring_catalog", "header", "sidecar", "index_tables", "selection", "archive",
+    "bodies", "shapes", "terrain", "geometry", "ring_catalog", "header", "sidecar", "index_tables", "selection", "archive",
     "listing", "kernels", "spice", "star_sources", "stars", "spc_text", "spc_files", "maplets",
 )  # fmt: skip
 

@@ -12,6 +12,7 @@ from catalogs.maplets import MapletCatalogProblem, map_files, open_catalog, writ
 from catalogs.shapes import read_solid
 from catalogs.spc_files import MapFile, map_of, read_map, write_map
 from catalogs.spc_text import LandmarkFile, SpcProblem, read_landmark, read_picture, write_landmark
+from catalogs.terrain import is_raster, read_terrain
 from pipeline.errors import ConfigurationError, GeometryError
 from pipeline.geometry.cutting import cut_maplet, spread_landmarks
 from pipeline.geometry.maplet import Maplet
@@ -70,7 +71,7 @@ def export_spc(
 
 
 def make_maplets(
-    shape: Annotated[Path, typer.Option("--shape", help="Shape file: OBJ, ICQ, plates, DSK.")],
+    shape: Annotated[Path, typer.Option("--shape", help="OBJ, ICQ, plates, DSK, or terrain model (GeoTIFF).")],
     scale: Annotated[list[float], typer.Option("--scale", help="Width of a cell in metres; may be repeated.")],
     output: Annotated[Path, typer.Option("--output", "-o", help="Catalogue to write; must not exist.")],
     size: Annotated[int, typer.Option("--size", min=9, max=999, help="Cells along a side, odd.")] = 99,
@@ -81,7 +82,8 @@ def make_maplets(
     if size % 2 == 0 or min(scale) <= 0:
         raise ConfigurationError("--size must be odd and every --scale above zero")
     try:
-        solid = read_solid(shape.read_bytes(), shape.name)
+        data = shape.read_bytes()
+        solid = read_terrain(shape) if is_raster(data) else read_solid(data, shape.name)
         number = _write(output, _cut(solid, size, [metres / 1000.0 for metres in scale], count, sigma), {})
     except OSError as error:
         raise ConfigurationError(f"{shape}: {error.strerror}") from error
