@@ -49,8 +49,8 @@ OUTSIDE_OF_SCIENCE = {
 # Schemas are Arrow's, which is not a file.
 ORDER_OF_CATALOGS = (
     "instruments", "label_text", "raw_images", "fits_images", "pds3_images", "gdal_images", "images", "labels",
-    "bodies", "shapes", "terrain", "geometry", "ring_catalog", "header", "sidecar", "index_tables", "selection", "archive",
-    "listing", "kernels", "spice", "star_sources", "stars", "spc_text", "spc_files", "maplets",
+    "bodies", "shapes", "terrain", "geometry", "ring_catalog", "header", "sidecar", "index_tables", "selection",
+    "archive", "listing", "kernels", "spice", "star_sources", "stars", "spc_text", "spc_files", "maplets",
 )  # fmt: skip
 
 
