@@ -31,7 +31,7 @@ FOUNDATIONS = {
     "imaging": ("psf", "illumination", "render"),
     "pose": (
         "records", "schemas", "se3", "normalise", "refine", "pnp", "ransac", "graph",
-        "estimator", "triangulation", "views", "bundle", "arc_factors", "arcs",
+        "estimator", "triangulation", "views", "bundle", "arc_landmarks", "arc_factors", "arcs",
     ),
     "predict": ("body_view", "bodies", "maplets"),
     "techniques": (
