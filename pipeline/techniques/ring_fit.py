@@ -21,6 +21,7 @@ from pipeline.techniques.body_base import compose
 from pipeline.techniques.ring_bands import Lattice, lattice_of, left_over
 from pipeline.techniques.ring_solve import (
     PIXEL_VARIANCE,
+    USUAL_TEXTURE,
     Equations,
     Layout,
     Levers,
@@ -59,6 +60,8 @@ _MOST_PIXELS = 400_000
 _ONE_STEP_BLURS = 1.5
 # Farthest that a step moves an edge across itself, and the array's centre.
 _FARTHEST_ACROSS_PX, _FARTHEST_PX = 3.0, 30.0
+# While a round moves the edges by more than this across themselves, their scatter is not that of the rings.
+_CALM_PX = 0.2
 # Units and pixels are chosen anew when the edges have moved so far.
 _RENEWED_PX, _SLACK_PX = 0.7, 2.0
 _TINY = 1e-12
@@ -328,7 +331,9 @@ def _linearised(job: _Job, now: _Round, units: RingUnits, pixels: _Pixels, turn:
     if turn >= _DOUBT_FROM:
         weight = unit_weights(loosened(equations, units, layout, now.radii))
     solved = (equations, weight, levers, values)
-    fit, radii = _concluded(job, units, solved, now.radii, pivot, turn >= 1)
+    pointing = np.concatenate([values[: layout.size], np.zeros(len(values) - layout.size)])
+    across = float(np.sqrt((shifts_of(levers, layout, pointing) ** 2).mean()))
+    fit, radii = _concluded(job, units, solved, now.radii, pivot, turn >= 1, across < _CALM_PX)
     full = np.zeros(3)
     full[: layout.size] = values[: layout.size]
     offset, rotation = compose(job.context, now.offset_vu, now.rotation_rad, pivot, full)
@@ -390,7 +395,7 @@ def _steps(
 
 def _concluded(
     job: _Job, units: RingUnits, solved: tuple[Equations, FloatArray, Levers, FloatArray], radii: Radii,
-    pivot: FloatArray, doubting: bool,
+    pivot: FloatArray, doubting: bool, calm_enough: bool,
 ) -> tuple[RingFit, Radii]:  # fmt: skip
     """Information at the end, with what the units' and features' scatter says of their sigmas."""
     equations, weight, levers, values = solved
@@ -400,10 +405,14 @@ def _concluded(
     freedom = float((weight * rank).sum())
     excess = max(1.0, float((weight * chi2).sum()) / max(freedom - min(float(size), freedom / 2), 1.0))
     calm = scaled(equations, excess)
-    radii = change_along(calm, units, layout, replace(radii, values=values[layout.radii]))
+    radii = replace(radii, values=values[layout.radii])
+    if calm_enough:
+        radii = change_along(calm, units, layout, radii)
     system = system_of(loosened(calm, units, layout, radii), weight, levers, layout, values)
     scale = _scales(levers, layout)
-    radii, texture = edge_scatter(system, layout, radii)
+    texture = USUAL_TEXTURE
+    if calm_enough:
+        radii, texture = edge_scatter(system, layout, radii)
     if doubting:
         radii = without_outlier(system, layout, radii, scale[0], texture)
     prior = prior_of(layout, radii, False)

@@ -22,8 +22,11 @@ _OUTLIER_SIGMAS, _LEAST_OTHERS, _LEAST_TROUBLE_PX = 4.0, 2, 0.25
 # Wrong wings, widths and geometry move also edges of rings whose light does not depend on the optical depth; and a
 # predicted contrast of nearly nothing is not to be believed.
 _LEAST_UNEVEN, _MOST_UNEVEN = 0.15, 4.0
-# Sigma of single edges at the start.
-_LOOSE_PX = 0.3
+# Degrees of freedom from which on a unit's residuals tell the noise.
+_SOUND_FREEDOM = 10.0
+# Relative unevenness of rings over the width of a blur, before an image has told its own: Saturn's A and B rings
+# scatter by a tenth and more from pixel to pixel in images that resolve them.
+USUAL_TEXTURE = 0.1
 # A perfect catalogue is one whose errors no pixel shows; a free radius has this share of its prior's weight.
 _PERFECT_PX, _FREE = 1e-4, 1e-12
 # Standard deviation over median absolute value of a normal variable.
@@ -153,7 +156,7 @@ def first_radii(scene: RingScene, layout: Layout) -> Radii:
     """No errors yet, catalogue's sigmas."""
     first = np.unique(scene.feature, return_index=True)[1]
     known = np.maximum(scene.sigma_km[first], _PERFECT_PX * layout.km_per_px)
-    sigma = np.concatenate([known, np.full(len(scene), _LOOSE_PX)])
+    sigma = np.concatenate([known, USUAL_TEXTURE * layout.texture_px])
     return Radii(np.zeros(len(sigma)), sigma, np.zeros(len(sigma), bool), np.zeros(len(scene)), np.ones(len(scene)))
 
 
@@ -246,7 +249,10 @@ def calibrated(gram: FloatArray, pull: FloatArray, fit: FloatArray, steps: Float
         Of the same units.
     """
     freedom = np.where(fit[:, 1] > 0, fit[:, 1] - 2.0 - steps, 0.0)
-    noise = np.maximum(fit[:, 0] / np.maximum(freedom, 1.0), 1.0)
+    scatter = fit[:, 0] / np.maximum(freedom, 1.0)
+    # Crowded rings look like noise to an image's own estimate of it; what the units leave shows when it is less.
+    sound = freedom >= _SOUND_FREEDOM
+    noise = np.maximum(scatter, min(1.0, float(np.median(scatter[sound]))) if sound.any() else 1.0)
     told = fit[:, 2] / noise
     sure = np.clip(1.0 - 2.0 * steps / np.maximum(told, _TINY), 0.0, 1.0) / noise
     return Equations(gram * sure[:, None, None], pull * sure[:, None], fit, np.where(sure > 0, freedom, 0.0))

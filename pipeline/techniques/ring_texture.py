@@ -12,12 +12,21 @@ from numpy.typing import NDArray
 
 from pipeline.imaging.ring_light import MOST_EDGES
 from pipeline.records import FloatArray
-from pipeline.techniques.ring_solve import Equations, Layout, Radii, System, inverse_of, own_shifts, prior_of, told_size
+from pipeline.techniques.ring_solve import (
+    USUAL_TEXTURE,
+    Equations,
+    Layout,
+    Radii,
+    System,
+    inverse_of,
+    own_shifts,
+    prior_of,
+    told_size,
+)
 from pipeline.techniques.ring_units import RingUnits
 
-# Relative unevenness of rings over the width of a blur: scale and width (natural logarithm) of the prior, and its grid.
-# Saturn's A and B rings scatter by a tenth and more from pixel to pixel in images that resolve them.
-USUAL_TEXTURE, _TEXTURE_WIDTH = 0.1, 0.7
+# Width (natural logarithm) of the prior of the rings' unevenness, and its grid.
+_TEXTURE_WIDTH = 0.7
 _TEXTURES = np.geomspace(1e-3, 0.4, 45)
 # Share of an edge's own sigma by which neighbouring stretches of so many pieces differ, and stretches that say as much.
 _ALONG_SHARE, _STRETCH, _ALONG_PRIOR = 0.2, 8, 8.0
