@@ -236,12 +236,14 @@ class OpenCVGtsamPoseEstimator:
             fit = refine(pose, points, xy, with_point_errors(pose, points, scale**2 * covariance, spread))
             if not np.isfinite(fit.chi2):
                 return None
+            # The points' errors are projected at the pose before; a few sigmas further they are the same.
+            near = spread is None or _moved2(fit, pose) < _SAME_ANSWER_SIGMA**2
             pose = fit.pose
             if not matches.stated:
                 scale *= self._scatter(fit, int(inlier.sum()))
             full = with_point_errors(pose, every[0], scale**2 * every[2], every[3])
             following = self._ransac.gate(pose, every[0], every[1], full) & matches.plane.ok
-            if following.tobytes() == inlier.tobytes() and matches.stated and spread is None:
+            if following.tobytes() == inlier.tobytes() and matches.stated and near:
                 return _Solution(method, fit, inlier, scale)
             if following.tobytes() == inlier.tobytes() or inlier.tobytes() in seen:
                 break
@@ -363,8 +365,13 @@ def curvature(fit: Fit, points_km: FloatArray, xy: FloatArray, covariance: Float
 
 def _same(one: Fit, other: Fit) -> bool:
     """Whether two minima are one answer."""
-    away = SE3Utils.error(one.pose, other.pose)
-    return bool(away @ SE3Utils.error_from_correction(one.information) @ away < _SAME_ANSWER_SIGMA**2)
+    return _moved2(one, other.pose) < _SAME_ANSWER_SIGMA**2
+
+
+def _moved2(fit: Fit, pose: Pose) -> float:
+    """Squared sigmas of a minimum by which another pose is away."""
+    away = SE3Utils.error(fit.pose, pose)
+    return float(away @ SE3Utils.error_from_correction(fit.information) @ away)
 
 
 def place_of(pose: Pose, calibration: CameraCalibration) -> LatLonAlt:
