@@ -390,8 +390,7 @@ def locate(
         images = images_of(prepared, picture, far, jacobian, make)
         peak = _far_peak(images, widest, match.rival_share)
         if peak.status is not PeakStatus.FOUND:
-            nowhere = np.full(2, np.nan), np.full((2, 2), np.nan)
-            return LandmarkMatch(peak.status, *nowhere, peak.correlation, peak.cells, widest, images)
+            return _lost(peak, widest, images)
         offset, bins = offset + jacobian @ peak.shift_cells, ladder(widest, False)
     grid, before = grid_pixels(view, maplet), 0
     for step, size in enumerate(bins + (1,) * (match.passes - 1)):
@@ -407,15 +406,18 @@ def locate(
         scale, background = _levels(images, peak, make.background_guard)
         if step >= len(bins) - 1 and np.abs(peak.shift_cells).max() < match.tolerance_cells:
             break
-    found = peak.status is PeakStatus.FOUND
-    covariance = np.full((2, 2), np.nan)
-    if found:
-        unresolved = _of_one_draw(unresolved_shift(maplet, prepared, make))
-        covariance = jacobian @ (peak.covariance_cells2 + unresolved) @ jacobian.T
-    place = offset if found else np.full(2, np.nan)
+    if peak.status is not PeakStatus.FOUND:
+        return _lost(peak, size, images, scale, background)
+    unresolved = _of_one_draw(unresolved_shift(maplet, prepared, make))
+    covariance = jacobian @ (peak.covariance_cells2 + unresolved) @ jacobian.T
     return LandmarkMatch(
-        peak.status, place, covariance, peak.correlation, peak.cells, size, images, scale, background
+        peak.status, offset, covariance, peak.correlation, peak.cells, size, images, scale, background
     )  # fmt: skip
+
+
+def _lost(peak: Peak, size: int, images: MapletImages, scale: float = 0.0, background: float = 0.0) -> LandmarkMatch:
+    nowhere, unknown = np.full(2, np.nan), np.full((2, 2), np.nan)
+    return LandmarkMatch(peak.status, nowhere, unknown, peak.correlation, peak.cells, size, images, scale, background)
 
 
 def _far_peak(images: MapletImages, size: int, share: float) -> Peak:
