@@ -96,6 +96,7 @@ def find_rings(
     if highest < options.min_correlation:
         return f"best correlation {highest:.2f}"
     fits: list[tuple[RingFit, Peak]] = []
+    lost: list[Peak] = []
     problem = ""
     for peak in _ranked(scene, lattice_of(frame, variance), peaks)[: options.followed]:
         # Peaks on one ridge run to the same place.
@@ -104,6 +105,7 @@ def find_rings(
         fit = fit_rings(scene, frame, variance, (np.array(peak.offset_vu), peak.rotation_rad), context, False)
         if isinstance(fit, str):
             problem = problem or fit
+            lost.append(peak)
         else:
             fits.append((fit, peak))
     if not fits:
@@ -111,7 +113,7 @@ def find_rings(
     turned = _turned(scene, frame, variance, fits[0], context)
     if turned is not None:
         fits.append(turned)
-    return _judged(scene, frame, variance, fits, context)
+    return _judged(scene, frame, variance, fits, lost, context)
 
 
 def _ranked(scene: RingScene, lattice: Lattice, peaks: list[Peak]) -> list[Peak]:
@@ -163,9 +165,10 @@ def _mean_square_across(fit: RingFit, gap_vu: FloatArray) -> float:
 
 
 def _judged(
-    scene: RingScene, frame: Frame, variance: Image, fits: list[tuple[RingFit, Peak]], context: NavContext
-) -> RingFix:
-    """The fit that leaves least, and how much more its rivals leave."""
+    scene: RingScene, frame: Frame, variance: Image, fits: list[tuple[RingFit, Peak]], lost: list[Peak],
+    context: NavContext,
+) -> RingFix:  # fmt: skip
+    """The fit that leaves least, and how much more its rivals leave: other fits, and peaks without one."""
     lattice = lattice_of(frame, variance)
     seen = [_as_seen(scene, lattice, fit) for fit, _ in fits]
     left = [value for _, value in seen]
@@ -175,8 +178,12 @@ def _judged(
     # Residuals beyond the noise are texture, whose pixels do not err one by one.
     count = best.pixels / max(1.0, best.mean)
     gaps = [
-        (0.5 * count * np.log(left[int(k)].mean / best.mean), np.nan)
+        (_gap(left[int(k)], best, count), np.nan)
         for k in order[1:] if not _one_place(fit, fits[int(k)][0])
+    ]  # fmt: skip
+    gaps += [
+        (_gap(left_over(scene, lattice, np.array(rival.offset_vu), rival.rotation_rad), best, count), np.nan)
+        for rival in lost if not _same(fit, rival)
     ]  # fmt: skip
     gaps += _scan(true, lattice, fit, best, count) + _elsewhere(true, lattice, fit, best, count, context)
     tries = float(np.prod([2.0 * m + 1.0 for m in context.search_margin_vu]))
@@ -185,6 +192,11 @@ def _judged(
     doubt += sum(float(np.exp(-np.clip(gap, 0.0, 700.0))) for gap, _ in gaps)
     rival = min(gaps, key=lambda entry: entry[0], default=(np.inf, np.nan))
     return RingFix(fit, peak.correlation, 1.0 / (1.0 + doubt), float(rival[0]), float(rival[1]))
+
+
+def _gap(left: LeftOver, best: LeftOver, count: float) -> float:
+    """Log-likelihood by which a place is worse than the best one."""
+    return 0.5 * count * float(np.log(max(left.mean / best.mean, 1e-12)))
 
 
 def _one_place(a: RingFit, b: RingFit) -> bool:
@@ -210,10 +222,11 @@ def _scan(
     values, vectors = np.linalg.eigh(fit.information[:2, :2])
     across = vectors[:, int(np.argmax(values))]
     shifts = np.arange(-_SCAN_PX, _SCAN_PX + 1).astype(float)
-    left = np.array([left_over(scene, lattice, fit.offset_vu + s * across, fit.rotation_rad).mean for s in shifts])
+    left = [left_over(scene, lattice, fit.offset_vu + s * across, fit.rotation_rad) for s in shifts]
+    mean = np.array([value.mean for value in left])
     middle: NDArray[np.int64] = np.arange(1, len(shifts) - 1)
-    dips = middle[(left[1:-1] < left[:-2]) & (left[1:-1] <= left[2:]) & (np.abs(shifts[1:-1]) > 1.0)]
-    return [(0.5 * count * float(np.log(max(left[k] / best.mean, 1e-12))), float(shifts[k])) for k in dips]
+    dips = middle[(mean[1:-1] < mean[:-2]) & (mean[1:-1] <= mean[2:]) & (np.abs(shifts[1:-1]) > 1.0)]
+    return [(_gap(left[k], best, count), float(shifts[k])) for k in dips]
 
 
 def _elsewhere(
@@ -228,5 +241,5 @@ def _elsewhere(
     result = []
     for shift in shifts[np.abs(shifts) > _SCAN_PX]:
         left = left_over(scene, lattice, fit.offset_vu + shift * across, fit.rotation_rad)
-        result.append((0.5 * count * float(np.log(max(left.mean / best.mean, 1e-12))), float(shift)))
+        result.append((_gap(left, best, count), float(shift)))
     return result
