@@ -13,6 +13,8 @@ from pipeline.techniques.ring_solve import PIXEL_VARIANCE
 _LATTICE = 16_000
 # Level and two slopes, which come before the bands.
 _PLANE = 3
+# Brightness of bands, over the image's range of light, beyond which they are not believed.
+_BRIGHTEST = 10.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,11 +27,14 @@ class Lattice:
         (rows, cols) light less its median, and inverse variance, zero where bad.
     step
         Between them, pixels.
+    amplitude
+        Range of the light.
     """
 
     data: FloatArray
     weight: FloatArray
     step: int
+    amplitude: float
 
 
 @dataclass(frozen=True)
@@ -73,8 +78,8 @@ def lattice_of(frame: Frame, variance: Image) -> Lattice:
     good: BoolArray = ~frame.bad[::step, ::step]
     data = frame.raw[::step, ::step].astype(float)
     weight = np.where(good, 1.0 / variance[::step, ::step].astype(float), 0.0)
-    level = float(np.median(data[good])) if good.any() else 0.0
-    return Lattice(data - level, weight, step)
+    low, level, high = np.quantile(data[good], (0.002, 0.5, 0.998)).tolist() if good.any() else (0.0, 0.0, 0.0)
+    return Lattice(data - level, weight, step, max(high - low, 1e-9))
 
 
 def left_over(
@@ -108,9 +113,15 @@ def left_over(
         lattice.weight, scene.curves, scene.means, scene.spread, blur, scene.forms, scene.sun, gram, pull,
     )  # fmt: skip
     pixels = float((lattice.weight > 0).sum())
-    plane, bands = (_solution(gram[:n, :n], pull[:n]) for n in (_PLANE, count))
+    # Bands that no pixel tells apart would be brighter than anything, with either sign.
+    usual = np.full(count, 1.0 / (_BRIGHTEST * lattice.amplitude) ** 2)
+    usual[:_PLANE] = 0.0
+    plane, bands = (_solution(gram[:n, :n] + np.diag(usual[:n]), pull[:n]) for n in (_PLANE, count))
     floor = 1e-9 * pixels
-    left = [max(float(power - pull[: len(x)] @ x), floor) / pixels for x in (bands, plane)]
+    left = [
+        max(float(power - 2.0 * pull[: len(x)] @ x + x @ gram[: len(x), : len(x)] @ x), floor) / pixels
+        for x in (bands, plane)
+    ]
     return LeftOver(left[0], left[1], pixels, np.diff(bands[_PLANE:], prepend=0.0))
 
 

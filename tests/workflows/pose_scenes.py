@@ -127,7 +127,7 @@ def _landmarks(rng: np.random.Generator, true: Pose, points: np.ndarray) -> dict
     wrong = rng.random(len(places)) < 0.05
     observed[wrong] += rng.uniform(15, 40, (int(wrong.sum()), 2))
     count = len(places)
-    names = [f"L{k}" for k in np.flatnonzero(np.isin(points, places).all(axis=1))]
+    names: list[Json] = [f"L{k}" for k in np.flatnonzero(np.isin(points, places).all(axis=1))]
     columns: dict[str, Json] = {
         "landmark": names, "status": ["found"] * count, "used": [True] * count,
         "observed_v_px": [None, *observed[1:, 0].tolist()], "observed_u_px": observed[:, 1].tolist(),
