@@ -1,10 +1,12 @@
 """Rings drawn by sub-pixels through the whole navigator: errors over their sigmas, and what must not be believed."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from pipeline.navigate import Navigation, NavigationOptions, navigate
-from pipeline.records import FloatArray, StarTable
+from pipeline.records import FloatArray, RingKind, StarTable
 from pipeline.status import Status, StatusReason, status_of
 from pipeline.techniques.base import TechniqueResult
 from tests.scenes.ring_scene import Band, RingScene, RingView, random_bands, ring_scene
@@ -147,6 +149,39 @@ def test_a_grating_of_like_ringlets_is_ambiguous() -> None:
     navigation = _run(scene)
     assert status_of(navigation.reason) is not Status.SUCCESS
     assert navigation.reason is StatusReason.AMBIGUOUS_MATCH
+
+
+def test_rings_are_found_whose_brightness_is_the_opposite_of_the_predicted_one() -> None:
+    rng = np.random.default_rng(12)
+    bands = random_bands(rng, 300.0, 1.0, 9, 0.02)
+    scene = ring_scene(rng, bands, RingView(0.7, 0.4, (300.0, 0.5)), (11.3, -9.1))
+    rings = scene.state.rings
+    assert rings is not None
+    other = {RingKind.RINGLET: RingKind.GAP, RingKind.GAP: RingKind.RINGLET}
+    features = tuple(replace(f, kind=other[f.kind], tau=1.0 - (f.tau or 0.0)) for f in rings.features)
+    scene = replace(scene, state=replace(scene.state, rings=replace(rings, features=features)))
+    navigation = _run(scene)
+    assert status_of(navigation.reason) is Status.SUCCESS
+    assert np.abs(_pulls(scene, navigation)).max() < 3.5
+
+
+def test_an_edge_that_drifts_moves_the_answer_within_its_sigma() -> None:
+    squares = []
+    for seed in range(8):
+        rng = np.random.default_rng([13, seed])
+        bands = [Band(radius, 6.0, 1.0, sigma=0.02) for radius in (260.0, 280.0, 300.0, 320.0, 340.0)]
+        # A wave of one and a half pixels, of which the catalogue knows nothing.
+        bands[2] = replace(bands[2], mode=(2, 1.5, float(rng.uniform(0.0, 6.0))))
+        view = RingView(0.9, 0.4, (300.0, float(rng.uniform(0.0, 6.0))))
+        scene = ring_scene(rng, tuple(bands), view, (4.0, -3.0))
+        rings = scene.state.rings
+        assert rings is not None
+        features = tuple(replace(feature, modes=np.zeros((0, 3))) for feature in rings.features)
+        scene = replace(scene, state=replace(scene.state, rings=replace(rings, features=features)))
+        navigation = _run(scene)
+        assert status_of(navigation.reason) is Status.SUCCESS
+        squares.append(_pulls(scene, navigation) ** 2)
+    assert float(np.concatenate(squares).mean()) < 2.5
 
 
 def test_an_empty_sky_has_no_rings() -> None:
