@@ -61,14 +61,16 @@ def observed(fit: RingFit, context: NavContext) -> Observed:
         prior = np.diag([3.0 / margin**2, 3.0 / margin**2, 1.0 / bound**2 if bound else 0.0][:size])
         covariance = np.asarray(np.linalg.inv(fit.information + prior))
         return _one_direction(covariance[:2, :2], fit.pivot_vu, size)
-    if size == 3 and rotation_shows(fit.information, context):
-        covariance = np.asarray(np.linalg.inv(fit.information))[:2, :2]
-        if np.linalg.eigvalsh(covariance)[1] <= (_SEEN_SHARE * margin) ** 2:
+    if size == 3:
+        turns = np.diag([0.0, 0.0, 3.0 / context.max_rotation_rad**2])
+        covariance = np.asarray(np.linalg.pinv(fit.information + turns, hermitian=True))[:2, :2]
+        if np.linalg.eigvalsh(covariance)[1] > (_SEEN_SHARE * margin) ** 2:
+            # A turn about the rings' own centre looks like a shift along them.
+            prior = turns + np.diag([3.0 / margin**2, 3.0 / margin**2, 0.0])
+            covariance = np.asarray(np.linalg.inv(fit.information + prior))[:2, :2]
+            return _one_direction(covariance, fit.pivot_vu, size, _bend(fit))
+        if rotation_shows(fit.information, context):
             return Observed(fit.information, fit.pivot_vu, 3)
-        # A turn about the rings' own centre, which looks like a shift along them.
-        prior = np.diag([3.0 / margin**2, 3.0 / margin**2, 3.0 / context.max_rotation_rad**2])
-        covariance = np.asarray(np.linalg.inv(fit.information + prior))[:2, :2]
-        return _one_direction(covariance, fit.pivot_vu, size, _bend(fit))
     settled = settle(fit.information, fit.pivot_vu, context)
     values = np.linalg.eigvalsh(settled.information[:2, :2])
     if values[0] < 1.0 / (_SEEN_SHARE * margin) ** 2:
