@@ -111,10 +111,16 @@ class Canvas:
         self.line(np.stack([back + across * 3, end, back - across * 3]), colour)
 
     def text(self, x: float, y: float, text: str, size: int, colour: Colour = WHITE, shade: bool = False) -> None:
-        """Write a line whose baseline starts at a place; ``shade`` darkens what lies behind it."""
+        """Write a line whose baseline starts at a place; ``shade`` darkens what lies behind it.
+
+        Near the border the line moves inward as far as it has to.
+        """
         mask, descent = rendered(text, size)
         rows, columns = mask.shape
         left, top = round(x), round(y) - rows + descent
+        height, width = self.pixels.shape[:2]
+        if 0 <= x < width and 0 <= y < height:
+            left, top = max(min(left, width - columns), 0), max(min(top, height - rows), 0)
         from_row, from_column = max(-top, 0), max(-left, 0)
         part = self.pixels[max(top, 0) : max(top + rows, 0), max(left, 0) : max(left + columns, 0)]
         if not part.size:

@@ -15,6 +15,7 @@ from tests.support import pilotage
 from workflows.cli import app
 from workflows.exits import EXIT_SOME_IN_ERROR
 from workflows.picture import draw_image
+from workflows.picture_canvas import Canvas
 from workflows.pictures import chosen, draw_all
 from workflows.samples.options import StarSampleOptions
 from workflows.samples.stars import make_star_sample
@@ -108,3 +109,11 @@ def test_the_run_remembers_its_archive(run: Path, tmp_path: Path) -> None:
     shutil.copytree(folder.root, tmp_path / "unfinished")
     (tmp_path / "unfinished" / "run.json").unlink()
     assert "--archive" in pilotage("picture", tmp_path / "unfinished", first).refusal()
+
+
+@pytest.mark.parametrize(("x", "y"), [(195.0, 50.0), (5.0, 3.0), (198.0, 99.0)])
+def test_a_name_near_the_border_is_written_inside_whole(x: float, y: float) -> None:
+    inner, outer = (Canvas(np.zeros((*side, 3), np.uint8), (0, 0), 1.0) for side in ((100, 200), (300, 400)))
+    inner.text(x, y, "Ringlet 7", 12)
+    outer.text(150.0, 150.0, "Ringlet 7", 12)
+    assert inner.pixels.sum() == pytest.approx(outer.pixels.sum())

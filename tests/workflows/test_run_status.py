@@ -34,7 +34,7 @@ def at_work(archive: Path, tmp_path: Path) -> Iterator[subprocess.Popen[bytes]]:
         [sys.executable, "-m", "workflows.cli", *map(str, arguments)], cwd=ROOT, stderr=subprocess.DEVNULL
     ) as process:
         until = time.monotonic() + _PATIENCE_S
-        while not list((tmp_path / "run" / "state").glob("[!.]*.json")):
+        while len(list((tmp_path / "run" / "state").glob("[!.]*.json"))) < 2:
             assert process.poll() is None
             assert time.monotonic() < until
             time.sleep(0.005)
@@ -49,7 +49,7 @@ def test_a_run_at_work_killed_and_finished(archive: Path, tmp_path: Path, at_wor
     now = status_of_run(folder)
     assert now.state is RunState.RUNNING
     assert now.planned == FRAMES
-    assert now.answered_now >= 1
+    assert now.answered_now >= 2
     assert now.left == FRAMES - now.answered_now
     assert now.last_outcome is not None
     assert abs((datetime.now(UTC) - now.last_outcome).total_seconds()) < _PATIENCE_S
