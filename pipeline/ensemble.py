@@ -21,6 +21,8 @@ from pipeline.techniques.base import NavContext, TechniqueResult
 
 # Relative size below which an eigenvalue of a scaled information matrix counts as zero.
 _NULL = 1e-13
+# Rotations tried where none is told.
+_TURNS = 401
 
 
 class EnsembleOptions(Options):
@@ -126,7 +128,7 @@ def ensemble(
     if not usable:
         return None
     arm = float(np.hypot(*context.camera_model.shape_vu)) / 2
-    turned_rad = _turned(usable)
+    turned_rad = _turned(usable, context)
     placed = [_place(result, context, arm, turned_rad) for result in usable]
     clusters = _clusters(placed, options)
     clusters.sort(key=_strength, reverse=True)
@@ -149,10 +151,29 @@ def _usable(results: Sequence[TechniqueResult]) -> tuple[list[TechniqueResult], 
     return inside or sound, excluded
 
 
-def _turned(results: Sequence[TechniqueResult]) -> float:
-    """Rotation of the answer that knows it best, zero where none does."""
-    seen = [r for r in results if r.degrees_of_freedom == 3 and r.information[2, 2] > 0]
-    return max(seen, key=lambda r: float(r.information[2, 2])).rotation_rad if seen else 0.0
+def _turned(results: Sequence[TechniqueResult], context: NavContext) -> float:
+    """Rotation of the answer that knows it best; where none does, the likeliest one if it decides on the place."""
+    turning = [r for r in results if r.degrees_of_freedom == 3]
+    seen = [r for r in turning if r.information[2, 2] > 0]
+    if seen:
+        return max(seen, key=lambda r: float(r.information[2, 2])).rotation_rad
+    far = [r for r in turning if _arm_decides(r.pivot_vu, context)]
+    return _likely_turn(max(far, key=lambda r: float(np.trace(r.information))), context) if far else 0.0
+
+
+def _arm_decides(pivot_vu: FloatArray, context: NavContext) -> bool:
+    """Whether an unknown rotation about a pivot moves the array's centre by more than the search's margin."""
+    arm = float(np.linalg.norm(pivot_vu - context.camera_model.centre_vu))
+    return arm * context.max_rotation_rad > float(np.min(context.search_margin_vu))
+
+
+def _likely_turn(result: TechniqueResult, context: NavContext) -> float:
+    """Rotation that leaves the array's centre and itself well within the bounds."""
+    centre, bound = context.camera_model.centre_vu, context.max_rotation_rad
+    turns = np.linspace(-bound, bound, _TURNS)
+    moved = np.array([move_pivot(result.offset_vu, turn, result.pivot_vu, centre)[0] for turn in turns.tolist()])
+    cost = ((moved / np.array(context.search_margin_vu)) ** 2).sum(axis=1) + (turns / bound) ** 2
+    return float(turns[int(np.argmin(cost))])
 
 
 def _place(result: TechniqueResult, context: NavContext, arm: float, turned_rad: float) -> _Placed:
@@ -260,6 +281,14 @@ def _combine(
     )  # fmt: skip
     if null_vu is not None:
         return _one_direction(blank, null_vu, state[:2], covariance[:2, :2])
+    pivots = [m.result.pivot_vu for m in members]
+    if turns and not observed and all(_arm_decides(pivot, context) for pivot in pivots):
+        # The turn looks like a shift along an arc about a far pivot, which the margin alone limits.
+        vectors = np.linalg.eigh(covariance[:2, :2])[1]
+        arm_px = min(float(np.linalg.norm(pivot - context.camera_model.centre_vu)) for pivot in pivots)
+        bow = float(np.max(context.search_margin_vu)) ** 2 / 3.0 / arm_px
+        lifted = covariance[:2, :2] + np.outer(vectors[:, 0], vectors[:, 0]) * bow**2 / 2.0
+        return _one_direction(blank, vectors[:, 1], state[:2], lifted)
     size = 3 if observed else 2
     scale = np.diag([1.0, 1.0, 1.0 / arm])[:size, :size]
     return replace(

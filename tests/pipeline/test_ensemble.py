@@ -309,3 +309,33 @@ def test_the_order_of_answers_does_not_matter() -> None:
     forward, backward = _fused(results, True), _fused(results[::-1], True)
     assert_allclose(forward.offset_vu, backward.offset_vu, atol=1e-9)
     assert_allclose(forward.covariance, backward.covariance, rtol=1e-9, atol=1e-15)
+
+
+def test_a_limb_about_a_far_centre_tells_one_direction_whatever_the_rotation() -> None:
+    rng = np.random.default_rng(5)
+    pulls = []
+    for _ in range(300):
+        arm, angle = float(rng.uniform(900.0, 9000.0)), float(rng.uniform(0.0, 2.0 * np.pi))
+        pivot = CENTRE + arm * np.array([np.cos(angle), np.sin(angle)])
+        offset = rng.uniform(-50.0, 50.0, 2)
+        # Rotations as large as the margin of the offset allows about that centre.
+        turn = float(np.clip(rng.uniform(-50.0, 50.0) / arm, -np.radians(5.0), np.radians(5.0)))
+        about, _ = move_pivot(offset, turn, CENTRE, pivot)
+        seen = TechniqueResult(
+            "limb", about + rng.normal(0.0, 0.1, 2), 0.0, information_of(BLIND), pivot, 0.999
+        )  # fmt: skip
+        estimate = _fused([seen], True)
+        assert estimate.reason is StatusReason.NAVIGATED_ONE_DIRECTION
+        assert estimate.observable_vu is not None
+        assert estimate.along_px is not None
+        assert estimate.sigma_along_px is not None
+        pulls.append((estimate.along_px - estimate.observable_vu @ offset) / estimate.sigma_along_px)
+    assert 0.2 < float(np.sqrt(np.mean(np.square(pulls)))) < 1.3
+    assert float((np.abs(pulls) < 2.5).mean()) > 0.95
+
+
+def test_a_near_pivot_tells_both_directions_without_a_rotation() -> None:
+    estimate = _fused([_three("disc", CENTRE + np.array([100.0, 50.0]), BLIND)], True)
+    assert estimate.reason is StatusReason.NAVIGATED
+    assert estimate.observable_vu is None
+    assert np.sqrt(np.linalg.eigvalsh(estimate.covariance)).max() < 10.0
