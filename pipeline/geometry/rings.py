@@ -172,14 +172,17 @@ def ring_forms(rings: RingSystem, bodies: tuple[Body, ...], pad_km: float) -> Fl
     Returns
     -------
     numpy.ndarray
-        (n, 12): centre, and rows of B with ``(x - c) B (x - c) = 1`` on the surface.
+        (n, 13): centre, rows of B with ``(x - c) B (x - c) = 1`` on the surface, and the factor on B that shrinks the
+        body as far below its true surface; huge where nothing is left of it.
     """
-    forms = np.zeros((len(bodies), 12))
+    forms = np.zeros((len(bodies), 13))
     for row, body in zip(forms, bodies, strict=True):
         turn = rings.plane_from_j2000 @ body.body_from_j2000.T
-        radii = body.radii_km + pad_km + 10.0 * body.haze_km
+        extra = pad_km + 10.0 * body.haze_km
+        radii = body.radii_km + extra
         row[:3] = rings.plane_from_j2000 @ (body.position_km - rings.position_km)
-        row[3:] = (turn @ np.diag(1.0 / radii**2) @ turn.T).ravel()
+        row[3:12] = (turn @ np.diag(1.0 / radii**2) @ turn.T).ravel()
+        row[12] = float((radii / np.maximum(body.radii_km - extra, 1e-6 * radii)).max()) ** 2
     return forms
 
 
@@ -189,7 +192,7 @@ def meets(forms: FloatArray, start_km: FloatArray, rays: FloatArray, within: Flo
     Parameters
     ----------
     forms
-        (m, 12) of :func:`ring_forms`.
+        (m, 13) of :func:`ring_forms`.
     start_km
         (3,) or (n, 3) starts.
     rays
@@ -204,7 +207,7 @@ def meets(forms: FloatArray, start_km: FloatArray, rays: FloatArray, within: Flo
     """
     struck = np.zeros(len(rays), bool)
     for form in forms:
-        matrix = form[3:].reshape(3, 3)
+        matrix = form[3:12].reshape(3, 3)
         gap = start_km - form[:3]
         a = ((rays @ matrix) * rays).sum(axis=1)
         b = ((rays @ matrix) * gap).sum(axis=1)

@@ -97,7 +97,7 @@ def _normal_integral(z):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _covered(forms, place, observer, sun):  # type: ignore[no-untyped-def]
-    """0 free, 1 a body in the line of sight before the plane, 2 behind it, 3 in a body's shadow."""
+    """0 free, 1 a body in the line of sight before the plane, 2 behind it, 4 its outline there, 3 in a shadow."""
     state = 0
     for k in range(forms.shape[0]):
         f = forms[k]
@@ -129,8 +129,12 @@ def _covered(forms, place, observer, sun):  # type: ignore[no-untyped-def]
             if beam == 0 and near > 0:
                 if near < 1.0:
                     return 1
-                state = 2
-            elif beam == 1 and far > 0 and state == 0:
+                within = f[12] * f[12] * b * b - f[12] * a * (f[12] * (c + 1.0) - 1.0)
+                if within < 0.0:
+                    state = 4
+                elif state == 0:
+                    state = 2
+            elif beam == 1 and far > 0 and (state == 0 or state == 2):
                 state = 3
     return state
 
@@ -246,8 +250,10 @@ def measure(  # type: ignore[no-untyped-def]
         cell = cell_of[at] if at < bins else -1
         if cell < 0:
             continue
-        if forms.shape[0] and _covered(forms, place, observer, sun) > 0:
-            continue
+        if forms.shape[0]:
+            state = _covered(forms, place, observer, sun)
+            if state != 0 and state != 2:
+                continue
         best, nearest = -1, reach
         for k in range(curves.shape[0]):
             if unit_of[cell, k] >= 0 and abs(polar[0] - means[k]) - spread[k] < nearest * scale * 1.1:
@@ -456,12 +462,15 @@ def band_equations(  # type: ignore[no-untyped-def]
     slopes, origin, turn, observer, first, step, data, weight, curves, means, spread, sigma, forms, sun, gram,
     pull,
 ):  # fmt: skip
-    """Normal equations of an image in level, two slopes, and the brightness outside of every edge; data's power."""
+    """Normal equations of an image in level, two slopes, and the brightness outside of every edge; power, pixels.
+
+    They come twice where there are bodies: for rings before the sky, and before a disc.
+    """
     place, polar, found = np.zeros(15), np.zeros(6), np.zeros(4)
     count = curves.shape[0]
     share, which = np.zeros(count + 4), np.zeros(count + 4, np.int64)
     rows, cols = data.shape
-    power = 0.0
+    power, used = 0.0, 0
     for i in range(rows):
         for j in range(cols):
             w = weight[i, j]
@@ -469,8 +478,13 @@ def band_equations(  # type: ignore[no-untyped-def]
                 continue
             if not look(slopes, origin, turn, observer, first[0] + step * i, first[1] + step * j, place):
                 continue
-            if forms.shape[0] and _covered(forms, place, observer, sun) > 0:
-                continue
+            region = 0
+            if forms.shape[0]:
+                state = _covered(forms, place, observer, sun)
+                if state != 0 and state != 2:
+                    continue
+                # Over a disc level and bands are others.
+                region = (count + 3) * (state // 2)
             scale = _radial(place, polar)
             radius, turned = polar[0], False
             reach = _FAR_SIGMAS * sigma * scale
@@ -500,8 +514,11 @@ def band_equations(  # type: ignore[no-untyped-def]
                 share[filled], which[filled] = before, 3 + count - 1
                 filled += 1
             power += w * data[i, j] ** 2
+            used += 1
+            for a in range(filled):
+                which[a] += region
             for a in range(filled):
                 pull[which[a]] += w * share[a] * data[i, j]
                 for b in range(filled):
                     gram[which[a], which[b]] += w * share[a] * share[b]
-    return power
+    return power, used

@@ -115,7 +115,7 @@ class RingScene:
     rays
         Over the array widened by the reach.
     forms
-        (m, 12) planet and moons, padded; empty without any near the rings.
+        (m, 13) planet and moons, padded; empty without any near the rings.
     sun
         (3,) ring frame; zero where unknown.
     """
@@ -133,7 +133,7 @@ class RingScene:
     unevenness: FloatArray
     fates: tuple[RingFate, ...]
     rays: RayGrid | None
-    forms: FloatArray = field(default_factory=lambda: np.zeros((0, 12)))
+    forms: FloatArray = field(default_factory=lambda: np.zeros((0, 13)))
     sun: FloatArray = field(default_factory=lambda: np.zeros(3))
 
     def __len__(self) -> int:
@@ -193,10 +193,10 @@ class RingScene:
         return project(self.state.camera_model, (points_km - pose.observer_km) @ pose.turn)[0]
 
     def hidden(self, pose: RingPose, edge: int, longitude_rad: FloatArray) -> BoolArray:
-        """Which points of an edge lie behind a body, before one or in a shadow."""
+        """Which points of an edge lie behind a body or in a shadow."""
         radius = self.radius_km(edge, longitude_rad)
         points = np.stack([radius * np.cos(longitude_rad), radius * np.sin(longitude_rad), 0.0 * radius], axis=1)
-        covered = meets(self.forms, pose.observer_km, points - pose.observer_km)
+        covered = meets(self.forms, pose.observer_km, points - pose.observer_km, np.ones(len(points)))
         if self.sun.any():
             covered |= meets(self.forms, points, np.broadcast_to(self.sun, points.shape))
         return covered

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.frame import Frame
 from pipeline.imaging.ring_light import band_equations
@@ -104,25 +105,34 @@ def left_over(
         Smallest at the right place, whatever the rings' brightness.
     """
     assert scene.rays is not None
-    count = _PLANE + len(scene)
+    each = _PLANE + len(scene)
+    count = each * (2 if len(scene.forms) else 1)
     gram, pull = np.zeros((count, count)), np.zeros(count)
     pose = scene.pose(offset_vu, rotation_rad)
     blur = float(np.sqrt(scene.sigma_px**2 + PIXEL_VARIANCE + slack_px**2))
-    power = band_equations(
+    power, used = band_equations(
         scene.rays.slopes, scene.origin, pose.turn, pose.observer_km, np.zeros(2), float(lattice.step), lattice.data,
         lattice.weight, scene.curves, scene.means, scene.spread, blur, scene.forms, scene.sun, gram, pull,
     )  # fmt: skip
-    pixels = float((lattice.weight > 0).sum())
+    # Of pixels that bodies or shadows do not cover under this pointing.
+    pixels = max(float(used), 1.0)
     # Bands that no pixel tells apart would be brighter than anything, with either sign.
-    usual = np.full(count, 1.0 / (_BRIGHTEST * lattice.amplitude) ** 2)
-    usual[:_PLANE] = 0.0
-    plane, bands = (_solution(gram[:n, :n] + np.diag(usual[:n]), pull[:n]) for n in (_PLANE, count))
+    plane = np.arange(count) % each < _PLANE
+    gram[~plane, ~plane] += 1.0 / (_BRIGHTEST * lattice.amplitude) ** 2
+    left, bands = _left(gram, pull, power, np.arange(count))
+    bare, _ = _left(gram, pull, power, np.flatnonzero(plane))
     floor = 1e-9 * pixels
-    left = [
-        max(float(power - 2.0 * pull[: len(x)] @ x + x @ gram[: len(x), : len(x)] @ x), floor) / pixels
-        for x in (bands, plane)
-    ]
-    return LeftOver(left[0], left[1], pixels, np.diff(bands[_PLANE:], prepend=0.0))
+    # The contrasts of the region that has more of the image.
+    region = each * int(np.argmax(gram.diagonal()[::each]))
+    contrasts = np.diff(bands[region + _PLANE : region + each], prepend=0.0)
+    return LeftOver(max(left, floor) / pixels, max(bare, floor) / pixels, pixels, contrasts)
+
+
+def _left(gram: FloatArray, pull: FloatArray, power: float, chosen: NDArray[np.int64]) -> tuple[float, FloatArray]:
+    """Weighted squares that some of the unknowns leave, and these."""
+    matrix, side = gram[np.ix_(chosen, chosen)], pull[chosen]
+    values = _solution(matrix, side)
+    return float(power - 2.0 * side @ values + values @ matrix @ values), values
 
 
 def _solution(gram: FloatArray, pull: FloatArray) -> FloatArray:

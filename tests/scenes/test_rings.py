@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pipeline.navigate import Navigation, NavigationOptions, navigate
-from pipeline.records import FloatArray, RingKind, StarTable
+from pipeline.records import Body, FloatArray, RingKind, StarTable
 from pipeline.status import Status, StatusReason, status_of
 from pipeline.techniques.base import TechniqueResult
 from tests.scenes.ring_scene import Band, RingScene, RingView, random_bands, ring_scene
@@ -182,6 +182,32 @@ def test_an_edge_that_drifts_moves_the_answer_within_its_sigma() -> None:
         assert status_of(navigation.reason) is Status.SUCCESS
         squares.append(_pulls(scene, navigation) ** 2)
     assert float(np.concatenate(squares).mean()) < 2.5
+
+
+@pytest.mark.parametrize("radius", [290.0, 190.0])
+def test_rings_before_a_disc_are_navigated(radius: float) -> None:
+    """Dark against it, where the catalogue has ringlets; of the smaller disc a part of the outline is in the frame."""
+    rng = np.random.default_rng(14)
+    bands = tuple(Band(r, 5.0, -0.5, sigma=0.02) for r in (300.0, 318.0, 333.0, 352.0))
+    view = RingView(0.35, 0.2, (330.0, np.pi / 2))
+    scene = ring_scene(rng, bands, view, (6.2, -4.4), margin_vu=(15.0, 15.0))
+    rings = scene.state.rings
+    assert rings is not None
+    pixels = np.indices(scene.pixels.shape).reshape(2, -1).T.astype(float)
+    middle = (np.array(scene.pixels.shape) - 1) / 2 + rings.position_km[[1, 0]] + scene.offset_vu
+    beyond = np.hypot(*(pixels - middle).T).reshape(scene.pixels.shape) > radius
+    # Sky beside the disc, at the level of the dark bands.
+    dark = rng.normal(float(np.quantile(scene.pixels, 0.02)), 4.0, scene.pixels.shape)
+    frame = np.where(beyond, dark, scene.pixels).astype(np.float32)
+    planet = Body("RINGED", None, rings.position_km, np.full(3, radius), np.eye(3), np.array([0.0, 0.0, -1.0]))
+    features = tuple(replace(f, kind=RingKind.RINGLET, tau=1.0) for f in rings.features)
+    state = replace(scene.state, bodies=(planet,), rings=replace(rings, features=features))
+    navigation = navigate(frame, None, state, StarTable.empty(), _OPTIONS)
+    edges = next(r for r in navigation.results if r.technique == "RingEdgeNav")
+    assert isinstance(edges, TechniqueResult)
+    assert edges.diagnostics["rank"] == 2.0
+    error = edges.offset_vu - scene.offset_vu
+    assert float(error @ edges.information @ error) < 12.0
 
 
 def test_an_empty_sky_has_no_rings() -> None:

@@ -85,8 +85,9 @@ def test_a_planet_before_the_rings_hides_them() -> None:
     points = 60.0 * np.stack([np.cos(longitude), np.sin(longitude), 0 * longitude], axis=1)
     ahead = (points - pose.observer_km) @ pose.turn
     hidden = scene.hidden(pose, 0, longitude)
-    # What is farther than the planet's centre lies behind its disc; the ansae stand free beside it.
-    assert hidden[np.argmax(ahead[:, 2])]
+    # What is farther than the planet's centre lies behind its disc; the near arm lies before it, the ansae beside it.
+    assert hidden[np.argmax(ahead[:2, 2])]
+    assert not hidden[np.argmin(ahead[:2, 2])]
     assert not hidden[2:].any()
 
 
