@@ -459,12 +459,12 @@ def assemble(gram, pull, weight, normal, lever, scale, edges, column, size, feat
 
 @numba.njit(cache=True, nogil=True)
 def band_equations(  # type: ignore[no-untyped-def]
-    slopes, origin, turn, observer, first, step, data, weight, curves, means, spread, sigma, forms, sun, gram,
+    slopes, origin, turn, observer, first, step, data, weight, curves, means, spread, sigma, forms, sun, discs, gram,
     pull,
 ):  # fmt: skip
     """Normal equations of an image in level, two slopes, and the brightness outside of every edge; power, pixels.
 
-    They come twice where there are bodies: for rings before the sky, and before a disc.
+    With ``discs`` they come twice: for rings before the sky, and before a disc.
     """
     place, polar, found = np.zeros(15), np.zeros(6), np.zeros(4)
     count = curves.shape[0]
@@ -481,7 +481,7 @@ def band_equations(  # type: ignore[no-untyped-def]
             region = 0
             if forms.shape[0]:
                 state = _covered(forms, place, observer, sun)
-                if state != 0 and state != 2:
+                if state != 0 and not (discs and state == 2):
                     continue
                 # Over a disc level and bands are others.
                 region = (count + 3) * (state // 2)

@@ -25,6 +25,8 @@ _EDGE_ON = 2e-3
 # Samples of a turn; samples inside a window that are enough, and pixels between them that are fine enough.
 _COARSE, _ENOUGH, _FINE_PX = 720, 120, 2.0
 _STRAIGHT_PX = 1.0
+# Share of edges before the sky that is enough to judge places by them alone: discs have structure of their own.
+_SKY_ENOUGH = 0.25
 # Pixels kept free around planets, moons and shadows.
 _BODY_PAD_PX = 5.0
 
@@ -118,6 +120,8 @@ class RingScene:
         (m, 13) planet and moons, padded; empty without any near the rings.
     sun
         (3,) ring frame; zero where unknown.
+    before_discs
+        Whether nearly all that is in sight of the edges lies before a disc.
     """
 
     state: State
@@ -135,6 +139,7 @@ class RingScene:
     rays: RayGrid | None
     forms: FloatArray = field(default_factory=lambda: np.zeros((0, 13)))
     sun: FloatArray = field(default_factory=lambda: np.zeros(3))
+    before_discs: bool = False
 
     def __len__(self) -> int:
         return len(self.curves)
@@ -257,7 +262,8 @@ def predict_rings(state: State, sigma_px: float, options: RingPredictionOptions)
         fates = tuple(RingFate(f.name, f.kind.value, 0.0, True, "edge_on") for f in rings.features)
         return replace(nothing, fates=fates)
     scene = _all_edges(state, rings, reach, sigma_px)
-    return _culled(_with_bodies(scene), options)
+    scene = _culled(_with_bodies(scene), options)
+    return replace(scene, before_discs=_before_discs(scene))
 
 
 def _all_edges(state: State, rings: RingSystem, reach: tuple[int, int], sigma_px: float) -> RingScene:
@@ -383,6 +389,24 @@ def _culled(scene: RingScene, options: RingPredictionOptions) -> RingScene:
         outer=scene.outer[keep], sigma_km=scene.sigma_km[keep], curves=np.ascontiguousarray(scene.curves[keep]),
         contrasts=scene.contrasts[keep], unevenness=scene.unevenness[keep], fates=fates,
     )  # fmt: skip
+
+
+def _before_discs(scene: RingScene) -> bool:
+    """Whether of the samples of edges that are in sight only a small part lies before the sky."""
+    if not len(scene.forms):
+        return False
+    pose = scene.pose(np.zeros(2), 0.0)
+    rows, cols = scene.state.camera_model.shape_vu
+    canvas = Window(0, 0, rows, cols).grown(*scene.reach_vu)
+    sky = disc = 0
+    for edge in range(len(scene)):
+        longitude = visible_longitudes(scene, pose, edge, canvas)
+        longitude = longitude[~scene.hidden(pose, edge, longitude)]
+        radius = scene.radius_km(edge, longitude)
+        points = np.stack([radius * np.cos(longitude), radius * np.sin(longitude), 0.0 * radius], axis=1)
+        before = meets(scene.forms, pose.observer_km, points - pose.observer_km)
+        sky, disc = sky + int((~before).sum()), disc + int(before.sum())
+    return sky < _SKY_ENOUGH * (sky + disc)
 
 
 def _px_per_km(scene: RingScene) -> float:

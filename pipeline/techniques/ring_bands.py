@@ -106,13 +106,14 @@ def left_over(
     """
     assert scene.rays is not None
     each = _PLANE + len(scene)
-    count = each * (2 if len(scene.forms) else 1)
+    count = each * (1 + scene.before_discs)
     gram, pull = np.zeros((count, count)), np.zeros(count)
     pose = scene.pose(offset_vu, rotation_rad)
     blur = float(np.sqrt(scene.sigma_px**2 + PIXEL_VARIANCE + slack_px**2))
     power, used = band_equations(
         scene.rays.slopes, scene.origin, pose.turn, pose.observer_km, np.zeros(2), float(lattice.step), lattice.data,
-        lattice.weight, scene.curves, scene.means, scene.spread, blur, scene.forms, scene.sun, gram, pull,
+        lattice.weight, scene.curves, scene.means, scene.spread, blur, scene.forms, scene.sun,
+        scene.before_discs, gram, pull,
     )  # fmt: skip
     # Of pixels that bodies or shadows do not cover under this pointing.
     pixels = max(float(used), 1.0)
