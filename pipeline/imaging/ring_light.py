@@ -515,8 +515,9 @@ def band_equations(  # type: ignore[no-untyped-def]
                 filled += 1
             power += w * data[i, j] ** 2
             used += 1
-            for a in range(filled):
-                which[a] += region
+            if region > 0:
+                for a in range(filled):
+                    which[a] += region
             for a in range(filled):
                 pull[which[a]] += w * share[a] * data[i, j]
                 for b in range(filled):
