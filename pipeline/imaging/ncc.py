@@ -5,6 +5,7 @@ the largest offset, so that every shift sees the whole of it: only the image nee
 template's mask).
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -171,6 +172,53 @@ def ncc_around(level: Level, template: Image, offset: tuple[int, int], reach: in
             if 0 <= top <= template.shape[0] - rows and 0 <= left <= template.shape[1] - cols:
                 result[i, j] = _ncc_at(level.image, level.weight, template, top, left)
     return result
+
+
+@dataclass(frozen=True)
+class MapPeak:
+    """A place higher than its neighbours on maps of correlations.
+
+    Attributes
+    ----------
+    shift
+        From the maps' middle, whole pixels of their level.
+    layer
+        Which of the maps is the highest there.
+    height
+        Correlation.
+    """
+
+    shift: tuple[int, int]
+    layer: int
+    height: float
+
+
+def highest_peaks(maps: Sequence[FloatArray], most: int, least: float) -> list[MapPeak]:
+    """Local maxima of the highest of several maps.
+
+    Parameters
+    ----------
+    maps
+        (rows, cols) each, one per rotation.
+    most
+        How many peaks are wanted.
+    least
+        Height that they exceed.
+
+    Returns
+    -------
+    list of MapPeak
+        Highest first.
+    """
+    stack = np.stack(maps)
+    best, which = stack.max(axis=0), stack.argmax(axis=0)
+    rows, cols = np.nonzero((best >= cv2.dilate(best, np.ones((3, 3)))) & (best > least))
+    order = np.argsort(best[rows, cols])[::-1][:most]
+    middle_v, middle_u = (n // 2 for n in best.shape)
+    return [
+        MapPeak((int(v) - middle_v, int(u) - middle_u), int(which[v, u]), float(best[v, u]))
+        for v, u in zip(rows[order], cols[order], strict=True)
+    ]
 
 
 def peak_of(values: FloatArray) -> tuple[FloatArray, float]:

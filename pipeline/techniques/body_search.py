@@ -12,7 +12,7 @@ from pydantic import Field
 
 from pipeline.frame import Frame
 from pipeline.geometry.pointing import move_pivot
-from pipeline.imaging.ncc import Level, make_level, ncc_around, ncc_map, peak_of, reduce
+from pipeline.imaging.ncc import Level, highest_peaks, make_level, ncc_around, ncc_map, peak_of, reduce
 from pipeline.imaging.render import Window
 from pipeline.options import Options
 from pipeline.predict.bodies import BodyScene
@@ -199,18 +199,13 @@ def _coarsest(pyramid: _Pyramid, context: NavContext, options: BodySearchOptions
     level = pyramid.level(factor)
     bound = context.max_rotation_rad
     thetas = np.linspace(-bound, bound, pyramid.rotations) if bound else np.zeros(1)
-    maps = np.stack([ncc_map(level, pyramid.turned(factor, float(theta))) for theta in thetas])
-    best, which = maps.max(axis=0), maps.argmax(axis=0)
-    around = cv2.dilate(best, np.ones((3, 3)))
-    rows, cols = np.nonzero((best >= around) & (best > -1.0))
-    order = np.argsort(best[rows, cols])[::-1][: options.candidates]
-    middle_v, middle_u = (n // 2 for n in best.shape)
+    maps = [ncc_map(level, pyramid.turned(factor, float(theta))) for theta in thetas]
     return [
         Peak(
-            (float((rows[k] - middle_v) * factor), float((cols[k] - middle_u) * factor)),
-            float(thetas[which[rows[k], cols[k]]]), float(best[rows[k], cols[k]]), float(best[rows[k], cols[k]]),
+            (float(found.shift[0] * factor), float(found.shift[1] * factor)), float(thetas[found.layer]),
+            found.height, found.height,
         )
-        for k in order
+        for found in highest_peaks(maps, options.candidates, -1.0)
     ]  # fmt: skip
 
 

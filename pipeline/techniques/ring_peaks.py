@@ -14,7 +14,7 @@ from pydantic import Field
 
 from pipeline.frame import Frame
 from pipeline.imaging.directions import Directions, direction_around, direction_map, directions_of, drawn_directions
-from pipeline.imaging.ncc import Level, make_level, ncc_around, ncc_map, peak_of
+from pipeline.imaging.ncc import Level, highest_peaks, make_level, ncc_around, ncc_map, peak_of
 from pipeline.options import Options
 from pipeline.predict.rings import RingScene
 from pipeline.records import FloatArray, Image
@@ -210,16 +210,12 @@ def _coarse_peaks(
 ) -> list[Peak]:
     factor = sight.factor
     surplus = tuple(int(np.ceil(margin / factor)) + 1 for margin in context.search_margin_vu)
-    maps = np.stack([sight.over_margin((surplus[0], surplus[1]), float(theta)) for theta in thetas])
-    best, which = maps.max(axis=0), maps.argmax(axis=0)
-    rows, cols = np.nonzero((best >= cv2.dilate(best, np.ones((3, 3)))) & (best > 0.0))
-    order = np.argsort(best[rows, cols])[::-1][: options.candidates]
+    maps = [sight.over_margin((surplus[0], surplus[1]), float(theta)) for theta in thetas]
     return [
         Peak(
-            (float((rows[k] - surplus[0]) * factor), float((cols[k] - surplus[1]) * factor)),
-            float(thetas[which[rows[k], cols[k]]]), float(best[rows[k], cols[k]]),
+            (float(found.shift[0] * factor), float(found.shift[1] * factor)), float(thetas[found.layer]), found.height
         )
-        for k in order
+        for found in highest_peaks(maps, options.candidates, 0.0)
     ]  # fmt: skip
 
 
