@@ -28,7 +28,7 @@ from pipeline.techniques.body_limb import (
 from pipeline.techniques.ring_annulus import RingAnnulusOptions, ring_annulus_nav
 from pipeline.techniques.ring_edge import RingEdgeOptions, ring_edge_nav
 from pipeline.techniques.ring_edges import RingEdgeTable, ring_edge_table
-from pipeline.techniques.ring_fit import smoothed_variance
+from pipeline.techniques.ring_image import ring_image
 from pipeline.techniques.ring_search import RingFix, find_rings
 from pipeline.techniques.star_field import StarFieldOptions, star_field_nav
 from pipeline.techniques.star_refine import StarRefineOptions, star_refine_nav
@@ -224,15 +224,15 @@ def _ring_pass(
     edge, annulus = techniques.RingEdgeNav, techniques.RingAnnulusNav
     if not (edge.enabled or annulus.enabled):
         return "not looked for", []
-    variance = smoothed_variance(frame)
+    image = ring_image(frame)
     # From where bodies were found, and from everywhere: each may be wrong.
     start = (disc.fit.offset_vu, disc.fit.rotation_rad) if isinstance(disc, DiscFix) else None
-    fix = find_rings(rings, frame, variance, start, context, edge.search)
+    fix = find_rings(rings, image, start, context, edge.search)
     outcomes: list[_Outcome] = []
     if edge.enabled:
         outcomes.append(ring_edge_nav(rings, fix, context, edge))
     if annulus.enabled:
-        outcomes.append(ring_annulus_nav(rings, frame, variance, fix, context, annulus))
+        outcomes.append(ring_annulus_nav(rings, image, fix, context, annulus))
     return fix, outcomes
 
 

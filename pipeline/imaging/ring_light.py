@@ -15,11 +15,13 @@ _SPACING = 16.0
 # Edges of one unit.
 MOST_EDGES = 10
 _FAR_SIGMAS = 4.0
+# Where a blurred step is over to a part in ten million.
+_OVER_SIGMAS = 5.2
 _ROOT2, _ROOT2PI = sqrt(2.0), sqrt(2.0 * pi)
 # Residuals beyond so many sigmas are stars and struck pixels.
 _CLIP_SIGMAS, _LEAST_CLIP = 6.0, 0.7
-# Departure of an edge from a straight line, over twice the fit's reach, up to which its curvature is one number.
-_FLAT_PX = 0.05
+# Departure of an edge from a straight line, over the fit's reach, up to which its curvature is one number.
+_FLAT_PX = 0.0125
 # Distance over which a unit's light changes by one slope.
 _SLOPE_PX = 8.0
 
@@ -92,7 +94,9 @@ def _to_edge(curve, polar, found):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _normal_integral(z):  # type: ignore[no-untyped-def]
-    return 0.5 * (1.0 + erf(z / _ROOT2))
+    if z > _OVER_SIGMAS:
+        return 1.0
+    return 0.5 * (1.0 + erf(z / _ROOT2)) if z > -_OVER_SIGMAS else 0.0
 
 
 @numba.njit(cache=True, nogil=True)
@@ -172,13 +176,16 @@ def profile_image(  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def near_edges(  # type: ignore[no-untyped-def]
-    slopes, origin, turn, observer, shape, curves, means, spread, reach, flat,
+    slopes, origin, turn, observer, shape, curves, means, spread, reach, stride, slant, flat,
 ):  # fmt: skip
-    """Flat indices of pixels within ``reach`` of an edge; how many. Far from all edges the walk takes long steps."""
+    """Flat indices of pixels within ``reach`` of an edge; how many. Far from all edges the walk takes long steps.
+
+    Only pixels are looked at whose ``u + slant * v`` is a multiple of ``stride``.
+    """
     place, polar, found = np.zeros(15), np.zeros(6), np.zeros(4)
     count = 0
     for v in range(shape[0]):
-        u = 0
+        u = -slant * v % stride
         while u < shape[1]:
             nearest = 64.0
             if look(slopes, origin, turn, observer, float(v), float(u), place):
@@ -199,6 +206,7 @@ def near_edges(  # type: ignore[no-untyped-def]
                 flat[count] = v * shape[1] + u
                 count += 1
             u += max(1, int(0.4 * (nearest - reach)))
+            u += (-slant * v - u) % stride
     return count
 
 
@@ -237,7 +245,7 @@ def measure(  # type: ignore[no-untyped-def]
     # Second order of the distance and curvature of a unit's edges: one pixel's do for all where they are small.
     shape = np.zeros((unit_edges.shape[0], MOST_EDGES, 2))
     flat_enough = np.zeros((unit_edges.shape[0], MOST_EDGES), np.bool_)
-    far2 = 4.0 * reach * reach
+    far2 = reach * reach
     for n in range(flat.shape[0]):
         unit[n] = -1
         v, u = float(flat[n] // cols), float(flat[n] % cols)
@@ -268,7 +276,8 @@ def measure(  # type: ignore[no-untyped-def]
             slot = k - unit_edges[mine, 0]
             _to_edge(curves[k], polar, found)
             s, bend = found[0], 0.0
-            if abs(s) < 2.0 * reach:
+            # Beyond the reach a step is over, wherever exactly its edge lies.
+            if abs(s) < reach:
                 if flat_enough[mine, slot]:
                     s, bend = s + shape[mine, slot, 0] * s * s, shape[mine, slot, 1]
                 else:
@@ -367,6 +376,9 @@ def _derivatives(distance, shifts, width, contrast, slopes):  # type: ignore[no-
     slopes[count] = 0.0
     for k in range(count):
         z = (distance[k] - shifts[k]) / width
+        slopes[k] = 0.0
+        if abs(z) > _OVER_SIGMAS:
+            continue
         steep = contrast[k] * exp(-0.5 * z * z) / (_ROOT2PI * width)
         slopes[k] = -steep
         slopes[count] -= steep * z / (2.0 * width)

@@ -2,13 +2,12 @@
 
 from pydantic import Field
 
-from pipeline.frame import Frame
 from pipeline.predict.rings import RingScene
-from pipeline.records import Image
 from pipeline.status import StatusReason
 from pipeline.techniques.base import NavContext, TechniqueFailure, TechniqueOptions, TechniqueResult
 from pipeline.techniques.ring_answer import ring_result
 from pipeline.techniques.ring_fit import fit_rings
+from pipeline.techniques.ring_image import RingImage
 from pipeline.techniques.ring_search import RingFix
 
 NAME = "RingAnnulusNav"
@@ -26,19 +25,16 @@ class RingAnnulusOptions(TechniqueOptions):
 
 
 def ring_annulus_nav(
-    scene: RingScene, frame: Frame, variance: Image, fix: RingFix | str, context: NavContext,
-    options: RingAnnulusOptions,
-) -> TechniqueResult | TechniqueFailure:  # fmt: skip
+    scene: RingScene, image: RingImage, fix: RingFix | str, context: NavContext, options: RingAnnulusOptions
+) -> TechniqueResult | TechniqueFailure:
     """The template's fit as a technique's answer.
 
     Parameters
     ----------
     scene
         Edges with predicted contrasts.
-    frame
-        Image.
-    variance
-        (rows, cols) DN^2.
+    image
+        Light and noise.
     fix
         Peak of the correlation, refined on the edges.
     context
@@ -56,7 +52,7 @@ def ring_annulus_nav(
     if fix.confidence < options.min_confidence:
         return TechniqueFailure(NAME, StatusReason.AMBIGUOUS_MATCH, "another place fits nearly as well")
     start = (fix.fit.offset_vu, fix.fit.rotation_rad)
-    fit = fit_rings(scene, frame, variance, start, context, True)
+    fit = fit_rings(scene, image, start, context, True, image.enough_pixels)
     if isinstance(fit, str):
         return TechniqueFailure(NAME, StatusReason.NO_MATCH, fit)
     result = ring_result(NAME, scene, fix, fit, context, options, 1)

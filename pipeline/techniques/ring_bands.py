@@ -5,37 +5,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.frame import Frame
 from pipeline.imaging.ring_light import band_equations
 from pipeline.predict.rings import RingScene
-from pipeline.records import BoolArray, FloatArray, Image
+from pipeline.records import FloatArray
+from pipeline.techniques.ring_image import Lattice
 from pipeline.techniques.ring_solve import PIXEL_VARIANCE
 
-_LATTICE = 16_000
 # Level and two slopes, which come before the bands.
 _PLANE = 3
 # Brightness of bands, over the image's range of light, beyond which they are not believed.
 _BRIGHTEST = 10.0
-
-
-@dataclass(frozen=True, eq=False)
-class Lattice:
-    """Single pixels of an image, far enough apart to be few.
-
-    Attributes
-    ----------
-    data, weight
-        (rows, cols) light less its median, and inverse variance, zero where bad.
-    step
-        Between them, pixels.
-    amplitude
-        Range of the light.
-    """
-
-    data: FloatArray
-    weight: FloatArray
-    step: int
-    amplitude: float
 
 
 @dataclass(frozen=True)
@@ -58,29 +37,6 @@ class LeftOver:
     bare: float
     pixels: float
     contrasts: FloatArray
-
-
-def lattice_of(frame: Frame, variance: Image) -> Lattice:
-    """Pixels of an image for :func:`left_over`.
-
-    Parameters
-    ----------
-    frame
-        Image.
-    variance
-        (rows, cols) DN^2.
-
-    Returns
-    -------
-    Lattice
-        Of some 16 000 pixels.
-    """
-    step = max(1, int(np.sqrt(frame.raw.size / _LATTICE)))
-    good: BoolArray = ~frame.bad[::step, ::step]
-    data = frame.raw[::step, ::step].astype(float)
-    weight = np.where(good, 1.0 / variance[::step, ::step].astype(float), 0.0)
-    low, level, high = np.quantile(data[good], (0.002, 0.5, 0.998)).tolist() if good.any() else (0.0, 0.0, 0.0)
-    return Lattice(data - level, weight, step, max(high - low, 1e-9))
 
 
 def left_over(

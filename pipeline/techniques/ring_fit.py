@@ -7,18 +7,18 @@ that it is absorbed where other edges, or the edge's own curvature, allow it, an
 
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.frame import Frame
 from pipeline.geometry.rotations import plane_rotation
-from pipeline.imaging.ring_light import MOST_EDGES, measure, near_edges, unit_equations
-from pipeline.predict.rings import RingPose, RingScene
-from pipeline.records import BoolArray, FloatArray, Image, Record
+from pipeline.imaging.ring_light import MOST_EDGES, unit_equations
+from pipeline.predict.rings import RingScene
+from pipeline.records import BoolArray, FloatArray, Record
 from pipeline.techniques.base import NavContext
 from pipeline.techniques.body_base import compose
-from pipeline.techniques.ring_bands import Lattice, lattice_of, left_over
+from pipeline.techniques.ring_bands import left_over
+from pipeline.techniques.ring_image import RingImage
+from pipeline.techniques.ring_pixels import EdgePixels, measured, select_pixels
 from pipeline.techniques.ring_solve import (
     PIXEL_VARIANCE,
     USUAL_TEXTURE,
@@ -55,15 +55,16 @@ _FIRST_WIDENING = 1.5
 _DOUBT_FROM = 2
 # A step sharper than the pixels that sample it would stop at the nearest gap between two of them.
 _LEAST_VARIANCE_PX2, _MOST_WIDENING = PIXEL_VARIANCE + 0.05, 4.0
-_MOST_PIXELS = 400_000
 # Edges nearer to each other than so many blurs make one step.
 _ONE_STEP_BLURS = 1.5
 # Farthest that a step moves an edge across itself, and the array's centre.
 _FARTHEST_ACROSS_PX, _FARTHEST_PX = 3.0, 30.0
 # While a round moves the edges by more than this across themselves, their scatter is not that of the rings.
 _CALM_PX = 0.2
+# Rounds that learn the scatter; afterwards it stays, or fit and scatter would follow each other for ever.
+_LEARNING = 3
 # Units and pixels are chosen anew when the edges have moved so far.
-_RENEWED_PX, _SLACK_PX = 0.7, 2.0
+_RENEWED_PX = 0.7
 _TINY = 1e-12
 
 
@@ -98,12 +99,14 @@ class RingFit(Record):
         Variance of the units' shifts over what noise allows.
     chi2_per_pixel
         Median of the units.
-    pixels
-        Pixels in the fit.
+    pixels, stride
+        Pixels in the fit; pixels of the image for one of these.
     width_px2
         Change of the blur's variance.
     significance
         Light explained by the steps over level and slope, chi-square.
+    radii
+        Errors of features and edges and what is believed of them, to go on from.
     """
 
     offset_vu: FloatArray
@@ -122,19 +125,10 @@ class RingFit(Record):
     excess: float
     chi2_per_pixel: float
     pixels: int
+    stride: int
     width_px2: float
     significance: float
-
-
-@dataclass(frozen=True, eq=False)
-class _Pixels:
-    """Pixels near edges, sorted by unit; ``amplitude`` is the range of their light."""
-
-    data: FloatArray
-    variance: FloatArray
-    distance: FloatArray
-    starts: NDArray[np.int64]
-    amplitude: float
+    radii: Radii
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,6 +141,7 @@ class _Round:
     radii: Radii
     moved_px: float
     moved_sigmas: float
+    learned: int
     fit: RingFit | None
 
 
@@ -155,85 +150,73 @@ class _Job:
     """What does not change during a fit."""
 
     scene: RingScene
-    frame: Frame
-    variance: Image
+    image: RingImage
     context: NavContext
     layout: Layout
     tied: bool
-    lattice: Lattice
 
     @property
     def reach_px(self) -> float:
         """Distance from an edge up to which pixels are used."""
-        return 3.0 * float(np.sqrt(self.layout.blur2)) + 1.5
+        return 3.0 * self.blur_px + 1.5
+
+    @property
+    def blur_px(self) -> float:
+        """Sigma of a blurred step."""
+        return float(np.sqrt(self.layout.blur2))
 
     @property
     def near_px(self) -> float:
         """Distance below which edges share a step."""
-        return _ONE_STEP_BLURS * float(np.sqrt(self.layout.blur2))
-
-
-def smoothed_variance(frame: Frame) -> Image:
-    """Variance of each pixel by its neighbourhood's level, which its own noise hardly moves.
-
-    Parameters
-    ----------
-    frame
-        Image.
-
-    Returns
-    -------
-    numpy.ndarray
-        (rows, cols) DN^2.
-    """
-    return np.asarray(frame.noise.variance(np.asarray(cv2.blur(frame.raw, (3, 3)), np.float32)), np.float32)
+        return _ONE_STEP_BLURS * self.blur_px
 
 
 def fit_rings(
-    scene: RingScene, frame: Frame, variance: Image, start: tuple[FloatArray, float], context: NavContext, tied: bool
-) -> RingFit | str:
+    scene: RingScene, image: RingImage, start: tuple[FloatArray, float] | RingFit, context: NavContext, tied: bool,
+    most_pixels: int,
+) -> RingFit | str:  # fmt: skip
     """Fit all edges from a start that is right to a pixel or two.
 
     Parameters
     ----------
     scene
         Edges.
-    frame
-        Image.
-    variance
-        Of :func:`smoothed_variance`.
+    image
+        Light and noise.
     start
-        (2,) offset at the array centre and rotation.
+        (2,) offset at the array centre and rotation; or a fit with other pixels, which is continued.
     context
         Bounds.
     tied
         Whether a unit's contrasts are one multiple of the predicted ones (a template) or all free.
+    most_pixels
+        Pixels beyond which a lattice of them is used.
 
     Returns
     -------
     RingFit or str
         Or in one line why there is none.
     """
-    job = _Job(scene, frame, variance, context, layout_of(scene, context), tied, lattice_of(frame, variance))
-    radii = first_radii(scene, job.layout)
-    now = _Round(np.asarray(start[0], float), float(start[1]), 0.0, radii, np.inf, np.inf, None)
-    units: RingUnits | None = None
-    flat = np.zeros(0, np.int64)
-    wandered = np.inf
+    job = _Job(scene, image, context, layout_of(scene, context), tied)
     # A template starts from a fit of free edges.
-    for turn in range(int(tied), _ROUNDS):
+    now, turn = _begin(start, job), _DOUBT_FROM if isinstance(start, RingFit) else int(tied)
+    units: RingUnits | None = None
+    flat, stride = np.zeros(0, np.int64), 1
+    wandered = np.inf
+    while turn < _ROUNDS:
         pose = scene.pose(now.offset_vu, now.rotation_rad)
         if units is None or wandered > _RENEWED_PX or (turn == 1 and not tied):
             units = make_units(scene, pose, 2.0 * job.reach_px)
             if units is None or not len(units):
                 return "no edge is inside the array"
         if wandered > _RENEWED_PX:
-            flat, wandered = _select(job, pose), 0.0
+            flat, stride = select_pixels(scene, image, pose, job.reach_px, most_pixels)
+            wandered = 0.0
         if not tied and (units.present[:, 1:] & ~_apart(units, job.near_px)).any():
             # Near edges share a step in the ratio of their contrasts: better measured than predicted.
-            told = left_over(scene, job.lattice, now.offset_vu, now.rotation_rad)
+            told = left_over(scene, image.lattice, now.offset_vu, now.rotation_rad)
             job = replace(job, scene=replace(scene, contrasts=told.contrasts))
-        pixels = _measured(job, pose, units, flat)
+        pixels = measured(scene, image, pose, units, flat, job.reach_px, job.blur_px)
         after = _linearised(job, now, units, pixels, turn)
         if isinstance(after, str):
             return after
@@ -244,15 +227,22 @@ def fit_rings(
             return "the fit ran out of the search's bounds"
         if turn >= _DOUBT_FROM and (now.moved_px < _SETTLED_PX or now.moved_sigmas < _SETTLED_SIGMAS):
             break
+        turn += 1
     if now.fit is None or units is None:
         return "no edge is inside the array"
     if now.moved_sigmas > _LOST_SIGMAS and now.moved_px > _RENEWED_PX:
         return "the fit did not settle"
-    return _placed(now.fit, now, units)
+    return replace(now.fit, offset_vu=now.offset_vu, rotation_rad=now.rotation_rad, units=units, stride=stride)
 
 
-def _placed(fit: RingFit, now: _Round, units: RingUnits) -> RingFit:
-    return replace(fit, offset_vu=now.offset_vu, rotation_rad=now.rotation_rad, units=units)
+def _begin(start: tuple[FloatArray, float] | RingFit, job: _Job) -> _Round:
+    """Before the first round; a fit that is continued learns its scatter once more, from more pixels."""
+    if isinstance(start, RingFit):
+        return _Round(
+            start.offset_vu, start.rotation_rad, start.width_px2, start.radii, np.inf, np.inf, _LEARNING - 1, None
+        )
+    radii = first_radii(job.scene, job.layout)
+    return _Round(np.asarray(start[0], float), float(start[1]), 0.0, radii, np.inf, np.inf, 0, None)
 
 
 def _inside(now: _Round, context: NavContext) -> bool:
@@ -270,43 +260,7 @@ def _carried(units: RingUnits, before: _Round, after: _Round, context: NavContex
     return replace(units, places_vu=places, normal_vu=units.normal_vu @ turn)
 
 
-def _select(job: _Job, pose: RingPose) -> NDArray[np.int64]:
-    """Flat indices of good pixels near edges."""
-    scene, frame = job.scene, job.frame
-    assert scene.rays is not None
-    flat = np.zeros(frame.raw.size, np.int64)
-    count = near_edges(
-        scene.rays.slopes, scene.origin, pose.turn, pose.observer_km, np.array(frame.raw.shape), scene.curves,
-        scene.means, scene.spread, job.reach_px + _SLACK_PX, flat,
-    )  # fmt: skip
-    flat = flat[:count]
-    flat = flat[~frame.bad.ravel()[flat]]
-    # Of very many pixels a regular part is enough.
-    return np.ascontiguousarray(flat[:: 1 + len(flat) // _MOST_PIXELS])
-
-
-def _measured(job: _Job, pose: RingPose, units: RingUnits, flat: NDArray[np.int64]) -> _Pixels:
-    scene, frame = job.scene, job.frame
-    assert scene.rays is not None
-    unit = np.full(len(flat), -1, np.int64)
-    distance = np.zeros((len(flat), MOST_EDGES))
-    measure(
-        scene.rays.slopes, scene.origin, pose.turn, pose.observer_km, frame.raw.shape[1], flat, scene.curves,
-        scene.means, scene.spread, units.cell_of, units.span, units.unit_of, units.edges, job.reach_px,
-        float(np.sqrt(job.layout.blur2)), scene.forms, scene.sun, unit, distance,
-    )  # fmt: skip
-    order = np.argsort(unit, kind="stable")
-    order = order[np.searchsorted(unit[order], 0) :]
-    starts = np.searchsorted(unit[order], np.arange(len(units) + 1))
-    chosen = flat[order]
-    data = frame.raw.ravel()[chosen].astype(float)
-    low, high = np.quantile(data, (0.02, 0.98)) if len(data) else (0.0, 1.0)
-    return _Pixels(
-        data, job.variance.ravel()[chosen].astype(float), distance[order], starts, max(float(high - low), 1e-6)
-    )
-
-
-def _linearised(job: _Job, now: _Round, units: RingUnits, pixels: _Pixels, turn: int) -> _Round | str:
+def _linearised(job: _Job, now: _Round, units: RingUnits, pixels: EdgePixels, turn: int) -> _Round | str:
     """A few Gauss-Newton steps at fixed geometry."""
     layout, first = job.layout, turn == 0
     pivot = np.asarray(units.places_vu[:, 0].mean(axis=0))
@@ -333,7 +287,8 @@ def _linearised(job: _Job, now: _Round, units: RingUnits, pixels: _Pixels, turn:
     solved = (equations, weight, levers, values)
     pointing = np.concatenate([values[: layout.size], np.zeros(len(values) - layout.size)])
     across = float(np.sqrt((shifts_of(levers, layout, pointing) ** 2).mean()))
-    fit, radii = _concluded(job, units, solved, now.radii, pivot, turn >= 1, across < _CALM_PX)
+    learns = across < _CALM_PX and now.learned < _LEARNING
+    fit, radii = _concluded(job, units, solved, now.radii, pivot, turn >= 1, learns)
     full = np.zeros(3)
     full[: layout.size] = values[: layout.size]
     offset, rotation = compose(job.context, now.offset_vu, now.rotation_rad, pivot, full)
@@ -341,7 +296,8 @@ def _linearised(job: _Job, now: _Round, units: RingUnits, pixels: _Pixels, turn:
     moved = float(np.hypot(*full[:2])) + abs(float(full[2])) * arm
     step_made = full[: layout.size]
     sigmas = float(np.sqrt(np.maximum(np.vdot(step_made, fit.information @ step_made), 0.0)))
-    return _Round(offset, rotation, 0.0 if first else float(values[layout.size]), radii, moved, sigmas, fit)
+    width = 0.0 if first else float(values[layout.size])
+    return _Round(offset, rotation, width, radii, moved, sigmas, now.learned + learns, fit)
 
 
 def _shortening(step: FloatArray, levers: Levers, layout: Layout) -> float:
@@ -353,7 +309,7 @@ def _shortening(step: FloatArray, levers: Levers, layout: Layout) -> float:
     )
 
 
-def _equations(job: _Job, units: RingUnits, pixels: _Pixels, levers: Levers, values: FloatArray) -> Equations:
+def _equations(job: _Job, units: RingUnits, pixels: EdgePixels, levers: Levers, values: FloatArray) -> Equations:
     layout = job.layout
     count = len(units)
     gram = np.zeros((count, MOST_EDGES + 1, MOST_EDGES + 1))
@@ -361,7 +317,7 @@ def _equations(job: _Job, units: RingUnits, pixels: _Pixels, levers: Levers, val
     step, share = _steps(units, job.scene.contrasts, job.near_px, job.tied)
     unit_equations(
         pixels.data, pixels.variance, pixels.distance, pixels.starts, units.edges, shifts_of(levers, layout, values),
-        float(np.sqrt(layout.blur2 + values[layout.size])), step, share, pixels.amplitude, gram, pull, fit,
+        float(np.sqrt(layout.blur2 + values[layout.size])), step, share, job.image.lattice.amplitude, gram, pull, fit,
     )  # fmt: skip
     return blended(calibrated(gram, pull, fit, 1.0 + step.max(axis=1)), units, step)
 
@@ -395,7 +351,7 @@ def _steps(
 
 def _concluded(
     job: _Job, units: RingUnits, solved: tuple[Equations, FloatArray, Levers, FloatArray], radii: Radii,
-    pivot: FloatArray, doubting: bool, calm_enough: bool,
+    pivot: FloatArray, doubting: bool, learns: bool,
 ) -> tuple[RingFit, Radii]:  # fmt: skip
     """Information at the end, with what the units' and features' scatter says of their sigmas."""
     equations, weight, levers, values = solved
@@ -406,12 +362,12 @@ def _concluded(
     excess = max(1.0, float((weight * chi2).sum()) / max(freedom - min(float(size), freedom / 2), 1.0))
     calm = scaled(equations, excess)
     radii = replace(radii, values=values[layout.radii])
-    if calm_enough:
+    if learns:
         radii = change_along(calm, units, layout, radii)
     system = system_of(loosened(calm, units, layout, radii), weight, levers, layout, values)
     scale = _scales(levers, layout)
     texture = USUAL_TEXTURE
-    if calm_enough:
+    if learns:
         radii, texture = edge_scatter(system, layout, radii)
     if doubting:
         radii = without_outlier(system, layout, radii, scale[0], texture)
@@ -430,8 +386,8 @@ def _concluded(
     figure = float(np.median(equations.fit[some, 0] / equations.freedom[some])) if some.any() else np.nan
     fit = RingFit(
         np.zeros(2), 0.0, pivot, marginal(total, size), radius, sigma, edge_km, excluded, units, shift,
-        shift_sigma, weight, equations.fit[:, 3:], excess, figure, int(equations.fit[:, 1].sum()),
-        float(values[size]), float((equations.fit[:, 2] * (weight > 0)).sum()),
+        shift_sigma, weight, equations.fit[:, 3:], excess, figure, int(equations.fit[:, 1].sum()), 1,
+        float(values[size]), float((equations.fit[:, 2] * (weight > 0)).sum()), radii,
     )  # fmt: skip
     return fit, radii
 

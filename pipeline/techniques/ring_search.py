@@ -9,13 +9,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.frame import Frame
 from pipeline.predict.rings import RingScene
-from pipeline.records import FloatArray, Image
+from pipeline.records import FloatArray
 from pipeline.techniques.base import NavContext
 from pipeline.techniques.body_base import compose
-from pipeline.techniques.ring_bands import Lattice, LeftOver, lattice_of, left_over
+from pipeline.techniques.ring_bands import LeftOver, left_over
 from pipeline.techniques.ring_fit import RingFit, fit_rings
+from pipeline.techniques.ring_image import Lattice, RingImage
 from pipeline.techniques.ring_peaks import Peak, RingSearchOptions, find_peaks
 
 # Error of a peak's place, in pixels, that a comparison of peaks forgives.
@@ -26,6 +26,8 @@ _SCAN_PX = 12
 _PLACES_ELSEWHERE = 16
 # Places nearer than this to the best one, in pixels across the edges, are the best one.
 _SAME_PX = 0.8
+# Pixels that are enough to find and compare places.
+_SEARCH_PIXELS = 60_000
 # Steps of a walk over all rotations about a place, at the farthest edge, and the most of them.
 _TURN_STEP_PX, _FEWEST_TURNS, _MOST_TURNS = 1.5, 11, 81
 
@@ -56,23 +58,17 @@ class RingFix:
 
 
 def find_rings(
-    scene: RingScene,
-    frame: Frame,
-    variance: Image,
-    start: tuple[FloatArray, float] | None,
-    context: NavContext,
+    scene: RingScene, image: RingImage, start: tuple[FloatArray, float] | None, context: NavContext,
     options: RingSearchOptions,
-) -> RingFix | str:
+) -> RingFix | str:  # fmt: skip
     """Search, fit the best peaks, and compare what they leave over.
 
     Parameters
     ----------
     scene
         Edges.
-    frame
-        Image.
-    variance
-        (rows, cols) DN^2.
+    image
+        Light and noise.
     start
         Offset at the array centre and rotation where bodies have told them, else None.
     context
@@ -85,7 +81,7 @@ def find_rings(
     RingFix or str
         Or in one line why there is none.
     """
-    peaks = find_peaks(scene, frame, context, options)
+    peaks = find_peaks(scene, image.frame, context, options)
     if start is not None:
         # Bodies may have told the place, or may be wrong: it is one more to be compared.
         height = peaks[0].correlation if peaks else 1.0
@@ -98,11 +94,12 @@ def find_rings(
     fits: list[tuple[RingFit, Peak]] = []
     lost: list[Peak] = []
     problem = ""
-    for peak in _ranked(scene, lattice_of(frame, variance), peaks)[: options.followed]:
+    for peak in _ranked(scene, image.lattice, peaks)[: options.followed]:
         # Peaks on one ridge run to the same place.
         if any(_same(fit, peak) for fit, _ in fits):
             continue
-        fit = fit_rings(scene, frame, variance, (np.array(peak.offset_vu), peak.rotation_rad), context, False)
+        start_here = (np.array(peak.offset_vu), peak.rotation_rad)
+        fit = fit_rings(scene, image, start_here, context, False, _SEARCH_PIXELS)
         if isinstance(fit, str):
             problem = problem or fit
             lost.append(peak)
@@ -110,10 +107,20 @@ def find_rings(
             fits.append((fit, peak))
     if not fits:
         return problem
-    turned = _turned(scene, frame, variance, fits[0], context)
+    turned = _turned(scene, image, fits[0], context)
     if turned is not None:
         fits.append(turned)
-    return _judged(scene, frame, variance, fits, lost, context)
+    fix = _judged(scene, image, fits, lost, context)
+    return replace(fix, fit=_refined(scene, image, fix.fit, context))
+
+
+def _refined(scene: RingScene, image: RingImage, fit: RingFit, context: NavContext) -> RingFit:
+    """The fit with as many pixels as its noise asks for, unless that leads elsewhere."""
+    wanted = image.enough_pixels
+    if fit.stride == 1 or wanted <= _SEARCH_PIXELS:
+        return fit
+    finer = fit_rings(scene, image, fit, context, False, wanted)
+    return finer if isinstance(finer, RingFit) and _one_place(fit, finer) else fit
 
 
 def _ranked(scene: RingScene, lattice: Lattice, peaks: list[Peak]) -> list[Peak]:
@@ -127,14 +134,13 @@ def _ranked(scene: RingScene, lattice: Lattice, peaks: list[Peak]) -> list[Peak]
 
 
 def _turned(
-    scene: RingScene, frame: Frame, variance: Image, found: tuple[RingFit, Peak], context: NavContext
+    scene: RingScene, image: RingImage, found: tuple[RingFit, Peak], context: NavContext
 ) -> tuple[RingFit, Peak] | None:
     """The best other rotation about where the rings were found: a round planet tells their place, not their turn."""
     fit, peak = found
     bound = context.max_rotation_rad
     if not bound:
         return None
-    lattice = lattice_of(frame, variance)
     arm = float(np.sqrt(((fit.units.places_vu - fit.pivot_vu) ** 2).sum(axis=-1)[fit.units.present].max()))
     count = int(np.clip(np.ceil(2.0 * bound * arm / _TURN_STEP_PX), _FEWEST_TURNS, _MOST_TURNS))
     turns = np.linspace(-bound, bound, count)
@@ -142,12 +148,12 @@ def _turned(
         compose(context, fit.offset_vu, fit.rotation_rad, fit.pivot_vu, np.array([0.0, 0.0, turn - fit.rotation_rad]))
         for turn in turns.tolist()
     ]
-    left = np.array([left_over(scene, lattice, offset, rotation).mean for offset, rotation in poses])
+    left = np.array([left_over(scene, image.lattice, offset, rotation).mean for offset, rotation in poses])
     left[np.abs(turns - fit.rotation_rad) * arm < 2.0 * _TURN_STEP_PX] = np.inf
     offset, rotation = poses[int(np.argmin(left))]
     if not np.isfinite(left).any():
         return None
-    other = fit_rings(scene, frame, variance, (offset, rotation), context, False)
+    other = fit_rings(scene, image, (offset, rotation), context, False, _SEARCH_PIXELS)
     start = Peak((float(offset[0]), float(offset[1])), rotation, peak.correlation)
     return None if isinstance(other, str) else (other, start)
 
@@ -165,11 +171,11 @@ def _mean_square_across(fit: RingFit, gap_vu: FloatArray) -> float:
 
 
 def _judged(
-    scene: RingScene, frame: Frame, variance: Image, fits: list[tuple[RingFit, Peak]], lost: list[Peak],
+    scene: RingScene, image: RingImage, fits: list[tuple[RingFit, Peak]], lost: list[Peak],
     context: NavContext,
 ) -> RingFix:  # fmt: skip
     """The fit that leaves least, and how much more its rivals leave: other fits, and peaks without one."""
-    lattice = lattice_of(frame, variance)
+    lattice = image.lattice
     seen = [_as_seen(scene, lattice, fit) for fit, _ in fits]
     left = [value for _, value in seen]
     order = np.argsort([value.mean for value in left])
