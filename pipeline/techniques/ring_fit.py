@@ -105,8 +105,6 @@ class RingFit(Record):
         Change of the blur's variance.
     significance
         Light explained by the steps over level and slope, chi-square.
-    radii
-        Errors of features and edges and what is believed of them, to go on from.
     """
 
     offset_vu: FloatArray
@@ -128,7 +126,6 @@ class RingFit(Record):
     stride: int
     width_px2: float
     significance: float
-    radii: Radii
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,7 +181,7 @@ def fit_rings(
     image
         Light and noise.
     start
-        (2,) offset at the array centre and rotation; or a fit with other pixels, which is continued.
+        (2,) offset at the array centre and rotation; or a fit with fewer pixels or free contrasts.
     context
         Bounds.
     tied
@@ -198,14 +195,17 @@ def fit_rings(
         Or in one line why there is none.
     """
     job = _Job(scene, image, context, layout_of(scene, context), tied)
-    # A template starts from a fit of free edges.
-    now, turn = _begin(start, job), _DOUBT_FROM if isinstance(start, RingFit) else int(tied)
+    place, rotation = (start.offset_vu, start.rotation_rad) if isinstance(start, RingFit) else start
+    radii = first_radii(scene, job.layout)
+    now = _Round(np.asarray(place, float), rotation, 0.0, radii, np.inf, np.inf, 0, None)
+    # From a fit's place edges are within their blur at once.
+    turn = int(isinstance(start, RingFit))
     units: RingUnits | None = None
     flat, stride = np.zeros(0, np.int64), 1
     wandered = np.inf
     while turn < _ROUNDS:
         pose = scene.pose(now.offset_vu, now.rotation_rad)
-        if units is None or wandered > _RENEWED_PX or (turn == 1 and not tied):
+        if units is None or wandered > _RENEWED_PX or turn == 1:
             units = make_units(scene, pose, 2.0 * job.reach_px)
             if units is None or not len(units):
                 return "no edge is inside the array"
@@ -233,16 +233,6 @@ def fit_rings(
     if now.moved_sigmas > _LOST_SIGMAS and now.moved_px > _RENEWED_PX:
         return "the fit did not settle"
     return replace(now.fit, offset_vu=now.offset_vu, rotation_rad=now.rotation_rad, units=units, stride=stride)
-
-
-def _begin(start: tuple[FloatArray, float] | RingFit, job: _Job) -> _Round:
-    """Before the first round; a fit that is continued learns its scatter once more, from more pixels."""
-    if isinstance(start, RingFit):
-        return _Round(
-            start.offset_vu, start.rotation_rad, start.width_px2, start.radii, np.inf, np.inf, _LEARNING - 1, None
-        )
-    radii = first_radii(job.scene, job.layout)
-    return _Round(np.asarray(start[0], float), float(start[1]), 0.0, radii, np.inf, np.inf, 0, None)
 
 
 def _inside(now: _Round, context: NavContext) -> bool:
@@ -387,7 +377,7 @@ def _concluded(
     fit = RingFit(
         np.zeros(2), 0.0, pivot, marginal(total, size), radius, sigma, edge_km, excluded, units, shift,
         shift_sigma, weight, equations.fit[:, 3:], excess, figure, int(equations.fit[:, 1].sum()), 1,
-        float(values[size]), float((equations.fit[:, 2] * (weight > 0)).sum()), radii,
+        float(values[size]), float((equations.fit[:, 2] * (weight > 0)).sum()),
     )  # fmt: skip
     return fit, radii
 

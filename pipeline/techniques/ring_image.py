@@ -11,7 +11,7 @@ from pipeline.records import BoolArray, FloatArray, Image
 _LATTICE = 16_000
 # Pixels that tell edges as well as all would, where their light is so many sigmas of a pixel's noise; with more noise
 # more are needed, in proportion to its square, up to the most.
-_ENOUGH_PIXELS, _ENOUGH_SNR, _MOST_PIXELS = 60_000, 25.0, 400_000
+_ENOUGH_PIXELS, _ENOUGH_SNR, _MOST_PIXELS = 100_000, 20.0, 400_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,6 +32,11 @@ class Lattice:
     weight: FloatArray
     step: int
     amplitude: float
+
+    def halved(self) -> "Lattice":
+        """Every second pixel of every second row."""
+        data, weight = (np.ascontiguousarray(values[::2, ::2]) for values in (self.data, self.weight))
+        return Lattice(data, weight, 2 * self.step, self.amplitude)
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,8 +60,12 @@ class RingImage:
     @property
     def enough_pixels(self) -> int:
         """Pixels from which on texture, not noise, limits a fit of many edges; few for clean images."""
-        weight = self.lattice.weight[self.lattice.weight > 0]
-        snr = self.lattice.amplitude * float(np.sqrt(np.median(weight))) if len(weight) else 0.0
+        good = self.lattice.weight > 0
+        if not good.any():
+            return _MOST_PIXELS
+        # Of the middle of the light: a planet in a corner says nothing of the rings.
+        low, high = np.quantile(self.lattice.data[good], (0.1, 0.9))
+        snr = float(high - low) * float(np.sqrt(np.median(self.lattice.weight[good])))
         wanted = _ENOUGH_PIXELS * (_ENOUGH_SNR / max(snr, 1e-3)) ** 2
         return int(np.clip(wanted, _ENOUGH_PIXELS, _MOST_PIXELS))
 

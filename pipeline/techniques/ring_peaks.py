@@ -35,7 +35,7 @@ class RingSearchOptions(Options):
     """How rings are looked for."""
 
     candidates: int = Field(6, ge=1, le=50, description="peaks of each correlation that are kept")
-    followed: int = Field(3, ge=1, le=20, description="of them, how many are fitted and compared")
+    followed: int = Field(5, ge=1, le=50, description="of them, how many are compared by what they leave over")
     rival_share: float = Field(0.75, gt=0, le=1, description="correlation of a peak worth following, over the highest")
     min_correlation: float = Field(0.02, ge=0, lt=1, description="correlation below which nothing was found")
     most_rotations: int = Field(61, ge=11, le=1001, description="most rotations tried at the coarse level")

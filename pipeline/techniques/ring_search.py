@@ -9,27 +9,24 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.geometry.rotations import plane_rotation
 from pipeline.predict.rings import RingScene
 from pipeline.records import FloatArray
 from pipeline.techniques.base import NavContext
-from pipeline.techniques.body_base import compose
 from pipeline.techniques.ring_bands import LeftOver, left_over
 from pipeline.techniques.ring_fit import RingFit, fit_rings
 from pipeline.techniques.ring_image import Lattice, RingImage
 from pipeline.techniques.ring_peaks import Peak, RingSearchOptions, find_peaks
+from pipeline.techniques.ring_places import Place, independent_pixels, likely_places, turned_place, worse_by
 
-# Error of a peak's place, in pixels, that a comparison of peaks forgives.
-_PEAK_PX = 1.0
-# A peak that leaves over so many times as much as the best one is not fitted.
-_HOPELESS = 8.0
+# Log-likelihood by which a fit elsewhere may be worse than the place that it started from.
+_ASTRAY = 10.0
 _SCAN_PX = 12
 _PLACES_ELSEWHERE = 16
 # Places nearer than this to the best one, in pixels across the edges, are the best one.
 _SAME_PX = 0.8
-# Pixels that are enough to find and compare places.
-_SEARCH_PIXELS = 60_000
-# Steps of a walk over all rotations about a place, at the farthest edge, and the most of them.
-_TURN_STEP_PX, _FEWEST_TURNS, _MOST_TURNS = 1.5, 11, 81
+# A fit nearer than this to where it started, likewise, has stayed there.
+_NEAR_PX = 1.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,122 +88,89 @@ def find_rings(
     highest = max(peak.correlation for peak in peaks)
     if highest < options.min_correlation:
         return f"best correlation {highest:.2f}"
-    fits: list[tuple[RingFit, Peak]] = []
-    lost: list[Peak] = []
-    problem = ""
-    for peak in _ranked(scene, image.lattice, peaks)[: options.followed]:
-        # Peaks on one ridge run to the same place.
-        if any(_same(fit, peak) for fit, _ in fits):
-            continue
-        start_here = (np.array(peak.offset_vu), peak.rotation_rad)
-        fit = fit_rings(scene, image, start_here, context, False, _SEARCH_PIXELS)
-        if isinstance(fit, str):
-            problem = problem or fit
-            lost.append(peak)
-        else:
-            fits.append((fit, peak))
-    if not fits:
-        return problem
-    turned = _turned(scene, image, fits[0], context)
+    places = likely_places(scene, image, peaks, context, options.followed)
+    found = _fitted(scene, image, places, context)
+    if not found.fits:
+        return found.problem
+    fit, place = found.fits[0]
+    turned = turned_place(scene, image, fit, place.peak.correlation, context)
     if turned is not None:
-        fits.append(turned)
-    fix = _judged(scene, image, fits, lost, context)
-    return replace(fix, fit=_refined(scene, image, fix.fit, context))
+        found = found.with_others(_fitted(scene, image, [turned], context))
+    return _judged(scene, image, found, context)
 
 
-def _refined(scene: RingScene, image: RingImage, fit: RingFit, context: NavContext) -> RingFit:
-    """The fit with as many pixels as its noise asks for, unless that leads elsewhere."""
-    wanted = image.enough_pixels
-    if fit.stride == 1 or wanted <= _SEARCH_PIXELS:
-        return fit
-    finer = fit_rings(scene, image, fit, context, False, wanted)
-    return finer if isinstance(finer, RingFit) and _one_place(fit, finer) else fit
+@dataclass(frozen=True, eq=False)
+class _Found:
+    """Fits with the places that they started from, places without a fit, and why the first of these has none."""
+
+    fits: list[tuple[RingFit, Place]]
+    lost: list[Place]
+    problem: str
+
+    def with_others(self, others: "_Found") -> "_Found":
+        return _Found(self.fits + others.fits, self.lost + others.lost, self.problem)
 
 
-def _ranked(scene: RingScene, lattice: Lattice, peaks: list[Peak]) -> list[Peak]:
-    """By what rings of free brightness leave over there, least first; those that leave by far more are dropped."""
-    if len(peaks) == 1:
-        return peaks
-    left = [
-        left_over(scene, lattice, np.array(peak.offset_vu), peak.rotation_rad, _PEAK_PX).mean for peak in peaks
-    ]
-    return [peaks[k] for k in np.argsort(left, kind="stable") if left[k] <= _HOPELESS * min(left)]
+def _fitted(scene: RingScene, image: RingImage, places: list[Place], context: NavContext) -> _Found:
+    found, enough = _Found([], [], ""), image.enough_pixels
+    for place in places:
+        peak = place.peak
+        # Places on one ridge run to the same one.
+        if any(_same(scene, fit, peak) for fit, _ in found.fits):
+            continue
+        start = (np.array(peak.offset_vu), peak.rotation_rad)
+        fit = fit_rings(scene, image, start, context, False, enough)
+        if isinstance(fit, RingFit) and place.settled:
+            _, seen = _as_seen(scene, image.lattice, fit)
+            if not _same(scene, fit, peak) and worse_by(image, seen.mean, place.left) > _ASTRAY:
+                fit = "the fit of single edges left the place that all of the light tells"
+        if isinstance(fit, str):
+            found = replace(found, lost=[*found.lost, place], problem=found.problem or fit)
+        else:
+            found.fits.append((fit, place))
+    return found
 
 
-def _turned(
-    scene: RingScene, image: RingImage, found: tuple[RingFit, Peak], context: NavContext
-) -> tuple[RingFit, Peak] | None:
-    """The best other rotation about where the rings were found: a round planet tells their place, not their turn."""
-    fit, peak = found
-    bound = context.max_rotation_rad
-    if not bound:
-        return None
-    arm = float(np.sqrt(((fit.units.places_vu - fit.pivot_vu) ** 2).sum(axis=-1)[fit.units.present].max()))
-    count = int(np.clip(np.ceil(2.0 * bound * arm / _TURN_STEP_PX), _FEWEST_TURNS, _MOST_TURNS))
-    turns = np.linspace(-bound, bound, count)
-    poses = [
-        compose(context, fit.offset_vu, fit.rotation_rad, fit.pivot_vu, np.array([0.0, 0.0, turn - fit.rotation_rad]))
-        for turn in turns.tolist()
-    ]
-    left = np.array([left_over(scene, image.lattice, offset, rotation).mean for offset, rotation in poses])
-    left[np.abs(turns - fit.rotation_rad) * arm < 2.0 * _TURN_STEP_PX] = np.inf
-    offset, rotation = poses[int(np.argmin(left))]
-    if not np.isfinite(left).any():
-        return None
-    other = fit_rings(scene, image, (offset, rotation), context, False, _SEARCH_PIXELS)
-    start = Peak((float(offset[0]), float(offset[1])), rotation, peak.correlation)
-    return None if isinstance(other, str) else (other, start)
+def _across_px(scene: RingScene, fit: RingFit, offset_vu: FloatArray, rotation_rad: float) -> float:
+    """Root mean square over a fit's units of how far another pointing lies from it across their edges."""
+    centre = scene.state.camera_model.centre_vu
+    places = fit.units.places_vu[:, 0]
+    turn = plane_rotation(rotation_rad - fit.rotation_rad).T
+    gap = centre + offset_vu + (places - centre - fit.offset_vu) @ turn - places
+    return float(np.sqrt(((fit.units.normal_vu[:, 0] * gap).sum(axis=1) ** 2).mean()))
 
 
-def _same(fit: RingFit, peak: Peak) -> bool:
-    gap = np.array(peak.offset_vu) - fit.offset_vu
-    across = np.sqrt(_mean_square_across(fit, gap))
-    return bool(across < 1.5) and abs(peak.rotation_rad - fit.rotation_rad) < 0.01
+def _same(scene: RingScene, fit: RingFit, peak: Peak) -> bool:
+    return _across_px(scene, fit, np.array(peak.offset_vu), peak.rotation_rad) < _NEAR_PX
 
 
-def _mean_square_across(fit: RingFit, gap_vu: FloatArray) -> float:
-    """Mean square over the units of a shift's part across the edges."""
-    normal = fit.units.normal_vu[:, 0]
-    return float(((normal @ gap_vu) ** 2).mean())
-
-
-def _judged(
-    scene: RingScene, image: RingImage, fits: list[tuple[RingFit, Peak]], lost: list[Peak],
-    context: NavContext,
-) -> RingFix:  # fmt: skip
-    """The fit that leaves least, and how much more its rivals leave: other fits, and peaks without one."""
-    lattice = image.lattice
+def _judged(scene: RingScene, image: RingImage, found: _Found, context: NavContext) -> RingFix:
+    """The fit that leaves least, and how much more its rivals leave: other fits, and places without one."""
+    fits, lattice = found.fits, image.lattice
     seen = [_as_seen(scene, lattice, fit) for fit, _ in fits]
     left = [value for _, value in seen]
     order = np.argsort([value.mean for value in left])
-    fit, peak = fits[int(order[0])]
+    fit, place = fits[int(order[0])]
     true, best = seen[int(order[0])]
-    # Residuals beyond the noise are texture, whose pixels do not err one by one.
-    count = best.pixels / max(1.0, best.mean)
+    count = independent_pixels(best.pixels, best.mean)
     gaps = [
-        (_gap(left[int(k)], best, count), np.nan)
-        for k in order[1:] if not _one_place(fit, fits[int(k)][0])
+        (_gap(left[int(k)].mean, best, count), np.nan)
+        for k in order[1:]
+        if _across_px(scene, fit, fits[int(k)][0].offset_vu, fits[int(k)][0].rotation_rad) > _SAME_PX
     ]  # fmt: skip
-    gaps += [
-        (_gap(left_over(scene, lattice, np.array(rival.offset_vu), rival.rotation_rad), best, count), np.nan)
-        for rival in lost if not _same(fit, rival)
-    ]  # fmt: skip
+    gaps += [(_gap(rival.left, best, count), np.nan) for rival in found.lost if not _same(scene, fit, rival.peak)]
     gaps += _scan(true, lattice, fit, best, count) + _elsewhere(true, lattice, fit, best, count, context)
     tries = float(np.prod([2.0 * m + 1.0 for m in context.search_margin_vu]))
     gain = 0.5 * count * np.log(best.bare / best.mean)
     doubt = tries * float(np.exp(np.clip(len(scene) + 3.0 - gain, -700.0, 50.0)))
     doubt += sum(float(np.exp(-np.clip(gap, 0.0, 700.0))) for gap, _ in gaps)
     rival = min(gaps, key=lambda entry: entry[0], default=(np.inf, np.nan))
-    return RingFix(fit, peak.correlation, 1.0 / (1.0 + doubt), float(rival[0]), float(rival[1]))
+    return RingFix(fit, place.peak.correlation, 1.0 / (1.0 + doubt), float(rival[0]), float(rival[1]))
 
 
-def _gap(left: LeftOver, best: LeftOver, count: float) -> float:
+def _gap(left: float, best: LeftOver, count: float) -> float:
     """Log-likelihood by which a place is worse than the best one."""
-    return 0.5 * count * float(np.log(max(left.mean / best.mean, 1e-12)))
-
-
-def _one_place(a: RingFit, b: RingFit) -> bool:
-    return _mean_square_across(a, b.offset_vu - a.offset_vu) < _SAME_PX**2
+    return 0.5 * count * float(np.log(max(left / best.mean, 1e-12)))
 
 
 def _as_seen(scene: RingScene, lattice: Lattice, fit: RingFit) -> tuple[RingScene, LeftOver]:
@@ -232,7 +196,7 @@ def _scan(
     mean = np.array([value.mean for value in left])
     middle: NDArray[np.int64] = np.arange(1, len(shifts) - 1)
     dips = middle[(mean[1:-1] < mean[:-2]) & (mean[1:-1] <= mean[2:]) & (np.abs(shifts[1:-1]) > 1.0)]
-    return [(_gap(left[k], best, count), float(shifts[k])) for k in dips]
+    return [(_gap(left[k].mean, best, count), float(shifts[k])) for k in dips]
 
 
 def _elsewhere(
@@ -247,5 +211,5 @@ def _elsewhere(
     result = []
     for shift in shifts[np.abs(shifts) > _SCAN_PX]:
         left = left_over(scene, lattice, fit.offset_vu + shift * across, fit.rotation_rad)
-        result.append((_gap(left, best, count), float(shift)))
+        result.append((_gap(left.mean, best, count), float(shift)))
     return result

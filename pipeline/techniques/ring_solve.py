@@ -390,8 +390,26 @@ def without_outlier(system: System, layout: Layout, radii: Radii, px_per_km: Flo
     count = layout.features
     if count <= _LEAST_OTHERS:
         return radii
-    sigma_all = np.concatenate([radii.sigma[:count], texture * layout.texture_px * np.sqrt(radii.wild)])
-    prior = prior_of(layout, replace(radii, sigma=sigma_all), False)
+    wide = np.concatenate([radii.sigma[:count], texture * layout.texture_px * np.sqrt(radii.wild)])
+    believed = replace(radii, sigma=wide)
+    gap, ratio = _against_others(system, layout, believed)
+    worst = int(np.argmax(ratio))
+    off = abs(gap[worst]) * px_per_km[worst] > _LEAST_TROUBLE_PX
+    if ratio[worst] <= _OUTLIER_SIGMAS or np.count_nonzero(ratio) - 1 < _LEAST_OTHERS or not off:
+        return radii
+    free = radii.free.copy()
+    free[worst] = True
+    # Where the others scatter more than the catalogue says once this one is free, all are less certain and none is to
+    # blame; before, one that is wrong moves all.
+    _, left = _against_others(system, layout, replace(believed, free=free))
+    scale = max(1.0, _MEDIAN_TO_SIGMA * float(np.median(left[left > 0]))) if (left > 0).any() else 1.0
+    return replace(radii, free=free) if ratio[worst] > _OUTLIER_SIGMAS * scale else radii
+
+
+def _against_others(system: System, layout: Layout, radii: Radii) -> tuple[FloatArray, FloatArray]:
+    """(features,) what all others would have each radius be, km; that over its sigma, zero where nothing is told."""
+    count = layout.features
+    prior = prior_of(layout, radii, False)
     prior[: layout.size] = 1.0 / layout.bounds**2
     inverse = inverse_of(system.gram + np.diag(prior))
     at = layout.size + 1 + np.arange(count)
@@ -401,20 +419,9 @@ def without_outlier(system: System, layout: Layout, radii: Radii, px_per_km: Flo
     # A prior of precision p taken away from one unknown of variance s^2: s^2 / (1 - p s^2), and the value likewise.
     left = np.maximum(1.0 - prior[at] * variance, 1e-9)
     gap = value / left
-    sigma = np.sqrt(variance / left + radii.sigma[at - layout.size - 1] ** 2)
+    sigma = np.sqrt(variance / left + radii.sigma[:count] ** 2)
     told = (np.diag(system.gram)[at] > 0) & ~radii.free[:count] & (left > 1e-6)
-    ratio = np.where(told, np.abs(gap) / sigma, 0.0)
-    if told.any():
-        # Where most features scatter more than the catalogue says, all are less certain and none is to blame.
-        ratio /= max(1.0, _MEDIAN_TO_SIGMA * float(np.median(ratio[told])))
-    worst = int(np.argmax(ratio))
-    others = int(told.sum()) - 1
-    off = abs(gap[worst]) * px_per_km[worst] > _LEAST_TROUBLE_PX
-    if ratio[worst] <= _OUTLIER_SIGMAS or others < _LEAST_OTHERS or not off:
-        return radii
-    free = radii.free.copy()
-    free[worst] = True
-    return replace(radii, free=free)
+    return gap, np.where(told, np.abs(gap) / sigma, 0.0)
 
 
 def inverse_of(matrix: FloatArray) -> FloatArray:

@@ -36,7 +36,8 @@ CONVENTION = (
     "both with an unknown radius of every feature within its sigma_a_km, an unknown brightness and background, and, "
     "where a rotation is fitted, its prior. observable_dv, observable_du: unit vector of the direction that is known "
     "best, whose sigma is *_along_px, the other direction's *_across_px; observable_directions: how many of them are "
-    "below 0.5 px; null: nothing is known. n_edges: edges whose own place could be found to 0.25 px; features: true "
+    "below 0.5 px, of rings alone one at most where none of the edges departs from a straight line by a pixel "
+    "(widest_bow_px); null: nothing is known. n_edges: edges whose own place could be found to 0.25 px; features: true "
     "a_km of theirs, that of a moved one included. opening_deg: from the ring plane to the spacecraft, "
     "opening_sun_deg: to the Sun, both positive to the north. kind ring_radius_trap: moved_feature lies moved_km "
     "beyond its own error"
@@ -48,6 +49,10 @@ SEEN_PX = 0.25
 """An edge counts as seen if its own place along its normal could be found to this."""
 OBSERVABLE_PX = 0.5
 """Directions whose Cramér-Rao sigma is smaller count as observable."""
+STRAIGHT_PX = 1.0
+"""Edges that depart less than this from a straight line tell one direction, as the navigator has it by its contract."""
+NEAR_PX = 0.5
+"""Distance from an edge of the pixels that tell its course."""
 MOST = 24
 """Edges that are followed in one pixel."""
 
@@ -135,6 +140,51 @@ def gather_information(s, d, across, radii, columns, weight, owner, sigma_px, fa
     return information, alone
 
 
+@numba.njit(cache=True)
+def edge_places(s, d, across, radii, weight, places):  # type: ignore[no-untyped-def]
+    """Points (n, 3: edge, row, column) of the edges in sight, one per pixel near them; returns their number."""
+    count = 0
+    for row in range(weight.shape[0]):
+        for column in range(weight.shape[1]):
+            i, j = row + BORDER_PX + 1, column + BORDER_PX + 1
+            slope_v, slope_u, _ = radius_slopes(radii, i, j)
+            slope = np.sqrt(slope_v * slope_v + slope_u * slope_u)
+            if weight[row, column] <= 0.0 or slope <= 0.0:
+                continue
+            here = across[i, j]
+            way, a, b, _ = in_plane(d, here[0], here[1], 1.0)
+            longitude = turned_longitude(a, b)
+            k = first_edge(d, longitude, radii[i, j] - NEAR_PX * slope)
+            while k < d.edges.shape[1] and count < len(places):
+                beyond = (radii[i, j] - edge_at(d, longitude, k)) / slope
+                if beyond < -NEAR_PX or _hidden(s, way, here[0], here[1]) or lit_share(d, a, b, slope) <= 0.5:
+                    break
+                places[count, 0] = k
+                places[count, 1] = row - beyond * slope_v / slope
+                places[count, 2] = column - beyond * slope_u / slope
+                count += 1
+                k += 1
+    return count
+
+
+def widest_bow(
+    shot: Shot, scene: Scene, disc: RingDisc, useless: NDArray[np.bool_], edges: list[int]
+) -> float:
+    """Return the largest width (px) of the strips that just hold what is in sight of one of some edges each."""
+    across = directions(shot.seen_with)
+    places = np.zeros((useless.size, 3))
+    count = edge_places(
+        scene.spheres, disc, across, radius_grid(disc, across), np.where(useless, 0.0, 1.0), places
+    )  # fmt: skip
+    widest = 0.0
+    for k in edges:
+        own = places[:count][places[:count, 0] == k, 1:]
+        if len(own) > 2:
+            aside = np.linalg.svd(own - own.mean(axis=0), full_matrices=False)[2][1]
+            widest = max(widest, float(np.ptp(own @ aside)))
+    return widest
+
+
 def bound(information: FloatArray, moved: tuple[int, ...], prior: FloatArray) -> FloatArray:
     """Return the information (n, n) on some of the first unknowns that is left when all others have to be found too.
 
@@ -167,7 +217,7 @@ def _translation(information: FloatArray, fits_rotation: bool) -> tuple[FloatArr
     return offset, float(1.0 / np.sqrt(max(left, WEAKEST)))
 
 
-def _told(information: FloatArray, fits_rotation: bool) -> Json:
+def _told(information: FloatArray, fits_rotation: bool, most: int) -> Json:
     """Return sigmas of the offset and which of its directions can be seen; a sigma is null where nothing is known."""
     offset, rotation = _translation(information, fits_rotation)
     values, vectors = np.linalg.eigh(offset)
@@ -180,7 +230,7 @@ def _told(information: FloatArray, fits_rotation: bool) -> Json:
         "cramer_rao_sigma_dv_px": axes[0],
         "cramer_rao_sigma_du_px": axes[1],
         "cramer_rao_sigma_rotation_deg": None if rotation is None else float(np.degrees(rotation)),
-        "observable_directions": int(seen),
+        "observable_directions": min(int(seen), most),
         "observable_dv": round(float(vectors[0, 1]), 6),
         "observable_du": round(float(vectors[1, 1]), 6),
         "cramer_rao_sigma_along_px": sigma[1],
@@ -231,8 +281,9 @@ def _openings(shot: Shot) -> tuple[float, float, float, float]:
 def ring_truth_entry(shot: Shot, scene: Scene, disc: RingDisc, taken: Taken) -> Json:
     """Return the entry of truth.json of a frame of rings."""
     information, alone, prior = ring_information(shot, scene, disc, taken.useless)
-    seen = [(k, a) for (a, k), info in zip(sorted_edges(), alone, strict=True) if info > 1.0 / SEEN_PX**2]
-    names = list(dict.fromkeys(FEATURES[k].name for k, _ in seen))
+    edges = sorted_edges()
+    seen = [n for n, info in enumerate(alone) if info > 1.0 / SEEN_PX**2]
+    names = list(dict.fromkeys(FEATURES[edges[n][1]].name for n in seen))
     opening, lit, phase, scale = _openings(shot)
     fits = shot.camera.optics.fit_camera_rotation
     radii = true_radii(shot.seed)
@@ -250,8 +301,11 @@ def ring_truth_entry(shot: Shot, scene: Scene, disc: RingDisc, taken: Taken) -> 
         "km_per_px": round(scale, 4),
         "snr": round(scene.snr, 3),
     }
-    entry |= _told(bound(information, WHOLE, prior), fits)
-    entry["rings_alone"] = _told(bound(information, RINGS, prior), fits)
+    bow = widest_bow(shot, scene, disc, taken.useless, seen)
+    most = 1 if bow < STRAIGHT_PX else 2
+    entry |= _told(bound(information, WHOLE, prior), fits, 2 if scene.bodies else most)
+    entry["rings_alone"] = _told(bound(information, RINGS, prior), fits, most)
+    entry["widest_bow_px"] = round(bow, 3)
     entry |= {
         "n_edges": len(seen),
         "n_features": len(names),
