@@ -159,7 +159,7 @@ def _judged(scene: RingScene, image: RingImage, found: _Found, context: NavConte
         if _across_px(scene, fit, fits[int(k)][0].offset_vu, fits[int(k)][0].rotation_rad) > _SAME_PX
     ]  # fmt: skip
     gaps += [(_gap(rival.left, best, count), np.nan) for rival in found.lost if not _same(scene, fit, rival.peak)]
-    gaps += _scan(true, lattice, fit, best, count) + _elsewhere(true, lattice, fit, best, count, context)
+    gaps += _scan(true, lattice, fit, best, count) + _elsewhere(true, lattice.halved(), fit, count, context)
     tries = float(np.prod([2.0 * m + 1.0 for m in context.search_margin_vu]))
     gain = 0.5 * count * np.log(best.bare / best.mean)
     doubt = tries * float(np.exp(np.clip(len(scene) + 3.0 - gain, -700.0, 50.0)))
@@ -200,7 +200,7 @@ def _scan(
 
 
 def _elsewhere(
-    scene: RingScene, lattice: Lattice, fit: RingFit, best: LeftOver, count: float, context: NavContext
+    scene: RingScene, lattice: Lattice, fit: RingFit, count: float, context: NavContext
 ) -> list[tuple[float, float]]:
     """Gaps and shifts of places all over the margin, across the edges: what any place explains of a textured image."""
     values, vectors = np.linalg.eigh(fit.information[:2, :2])
@@ -208,8 +208,8 @@ def _elsewhere(
     reach = float(np.min(np.asarray(context.search_margin_vu) / np.maximum(np.abs(across), 1e-9)))
     middle = float(across @ fit.offset_vu)
     shifts = np.linspace(-reach, reach, _PLACES_ELSEWHERE) - middle
-    result = []
-    for shift in shifts[np.abs(shifts) > _SCAN_PX]:
-        left = left_over(scene, lattice, fit.offset_vu + shift * across, fit.rotation_rad)
-        result.append((_gap(left.mean, best, count), float(shift)))
-    return result
+    far = shifts[np.abs(shifts) > _SCAN_PX].tolist()
+    here, *others = (
+        left_over(scene, lattice, fit.offset_vu + shift * across, fit.rotation_rad) for shift in (0.0, *far)
+    )
+    return [(_gap(left.mean, here, count), shift) for left, shift in zip(others, far, strict=True)]
