@@ -37,8 +37,8 @@ FOUNDATIONS = {
     "techniques": (
         "base", "star_fit", "star_match", "star_search", "star_inventory", "body_base", "body_search", "model_errors",
         "template_fit", "body_minor", "contour_fit", "limb_albedo", "lm", "line_search", "relief",
-        "ring_image", "ring_units", "ring_solve", "ring_texture", "ring_bands", "ring_pixels", "ring_fit", "ring_peaks",
-        "ring_places", "ring_search", "ring_answer",
+        "ring_image", "ring_units", "ring_unknowns", "ring_solve", "ring_texture", "ring_bands", "ring_pixels",
+        "ring_fit", "ring_peaks", "ring_places", "ring_search", "ring_answer",
         "maplet_regression", "maplet_search", "maplet_correlation", "maplet_alignment", "landmark_table",
         "landmark_state",
     ),

@@ -440,9 +440,12 @@ def unit_equations(  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def assemble(gram, pull, weight, normal, lever, scale, edges, column, size, features, total, right):  # type: ignore[no-untyped-def]
-    """Add units' equations in shifts to those in offset, rotation, blur, radii of features, and shifts of edges."""
-    value, where = np.zeros((MOST_EDGES + 1, 5)), np.zeros((MOST_EDGES + 1, 5), np.int64)
+def assemble(  # type: ignore[no-untyped-def]
+    gram, pull, weight, normal, lever, scale, way, edges, column, size, features, total, right,
+):  # fmt: skip
+    """Add units' equations in shifts to those in offset, rotation, blur, features' radii, edges' shifts and drifts."""
+    value, where = np.zeros((MOST_EDGES + 1, 6)), np.zeros((MOST_EDGES + 1, 6), np.int64)
+    own = size + 1 + features
     filled = np.zeros(MOST_EDGES + 1, np.int64)
     for n in range(edges.shape[0]):
         if weight[n] <= 0.0:
@@ -456,8 +459,11 @@ def assemble(gram, pull, weight, normal, lever, scale, edges, column, size, feat
                 value[k, 2], where[k, 2] = lever[n, k], 2
                 at = 3
             value[k, at], where[k, at] = scale[n, k], size + 1 + column[edges[n, 0] + k]
-            value[k, at + 1], where[k, at + 1] = 1.0, size + 1 + features + edges[n, 0] + k
+            value[k, at + 1], where[k, at + 1] = 1.0, own + edges[n, 0] + k
             filled[k] = at + 2
+            if way[n, k] != 0.0:
+                value[k, at + 2], where[k, at + 2] = way[n, k], own + len(column) + edges[n, 0] + k
+                filled[k] = at + 3
         value[count, 0], where[count, 0], filled[count] = 1.0, size, 1
         for a in range(count + 1):
             for i in range(filled[a]):

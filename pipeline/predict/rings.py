@@ -179,12 +179,17 @@ class RingScene:
 
     def radius_km(self, edge: int, longitude_rad: FloatArray) -> FloatArray:
         """(n,) radius of an edge's curve."""
+        return self.radii_km(np.full(len(longitude_rad), edge), longitude_rad)
+
+    def radii_km(self, edge: NDArray[np.int64], longitude_rad: FloatArray) -> FloatArray:
+        """(n,) radii of edges' curves, each at a longitude."""
         count = self.curves.shape[1]
         at = longitude_rad * (count / TURN)
         low = np.floor(at).astype(np.int64)
         share = at - low
-        curve = self.curves[edge]
-        return np.asarray(curve[low % count] * (1.0 - share) + curve[(low + 1) % count] * share)
+        return np.asarray(
+            self.curves[edge, low % count] * (1.0 - share) + self.curves[edge, (low + 1) % count] * share
+        )
 
     def place(self, pose: RingPose, edge: int, longitude_rad: FloatArray) -> tuple[FloatArray, BoolArray]:
         """Pixels of an edge's curve at longitudes, and which lie in front of the camera."""

@@ -9,7 +9,7 @@ from pipeline.imaging.ring_light import band_equations
 from pipeline.predict.rings import RingScene
 from pipeline.records import FloatArray
 from pipeline.techniques.ring_image import Lattice
-from pipeline.techniques.ring_solve import PIXEL_VARIANCE
+from pipeline.techniques.ring_unknowns import PIXEL_VARIANCE
 
 # Level and two slopes, which come before the bands.
 _PLANE = 3

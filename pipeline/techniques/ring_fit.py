@@ -20,22 +20,13 @@ from pipeline.techniques.ring_bands import left_over
 from pipeline.techniques.ring_image import RingImage
 from pipeline.techniques.ring_pixels import EdgePixels, measured, select_pixels
 from pipeline.techniques.ring_solve import (
-    PIXEL_VARIANCE,
-    USUAL_TEXTURE,
     Equations,
-    Layout,
-    Levers,
-    Radii,
     calibrated,
-    first_radii,
-    layout_of,
-    levers_of,
     marginal,
     misfit,
     own_shifts,
     prior_of,
     scaled,
-    shifts_of,
     step_of,
     system_of,
     unit_weights,
@@ -43,6 +34,18 @@ from pipeline.techniques.ring_solve import (
 )
 from pipeline.techniques.ring_texture import blended, change_along, edge_scatter, loosened
 from pipeline.techniques.ring_units import RingUnits, make_units
+from pipeline.techniques.ring_unknowns import (
+    PIXEL_VARIANCE,
+    USUAL_TEXTURE,
+    Layout,
+    Levers,
+    Radii,
+    first_radii,
+    layout_of,
+    levers_of,
+    shifts_of,
+    with_drifts,
+)
 
 _ROUNDS, _INNER = 10, 2
 # A fit has settled when a round moves it by less than this, or by less than this share of its sigma.
@@ -254,7 +257,8 @@ def _linearised(job: _Job, now: _Round, units: RingUnits, pixels: EdgePixels, tu
     """A few Gauss-Newton steps at fixed geometry."""
     layout, first = job.layout, turn == 0
     pivot = np.asarray(units.places_vu[:, 0].mean(axis=0))
-    levers = levers_of(units, pivot)
+    levers = levers_of(job.scene, units, pivot, job.blur_px)
+    now = replace(now, radii=with_drifts(now.radii, layout, levers.drift))
     weight = np.ones(len(units))
     base = np.append(now.offset_vu, now.rotation_rad)[: layout.size]
     values = np.concatenate([np.zeros(layout.size), [_FIRST_WIDENING if first else now.width], now.radii.values])
@@ -371,7 +375,10 @@ def _concluded(
     radius, sigma, excluded = np.zeros(known), np.zeros(known), np.zeros(known, bool)
     radius[layout.used], sigma[layout.used] = radii.values[:features], radius_sigma[:features]
     excluded[layout.used] = radii.free[:features]
-    edge_km = np.where(scale[1] > 0, radii.values[features:] / np.maximum(scale[1], _TINY), 0.0)
+    edge_km = np.where(scale[1] > 0, radii.values[layout.shifts] / np.maximum(scale[1], _TINY), 0.0)
+    # What drifts is the edge's own, not the fit's.
+    edge = np.minimum(levers.edges[:, :1] + np.arange(MOST_EDGES), len(layout.column) - 1)
+    shift = shift + radii.values[layout.drifts][edge] * levers.way
     some = equations.freedom > 0
     figure = float(np.median(equations.fit[some, 0] / equations.freedom[some])) if some.any() else np.nan
     fit = RingFit(

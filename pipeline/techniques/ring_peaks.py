@@ -19,7 +19,7 @@ from pipeline.options import Options
 from pipeline.predict.rings import RingScene
 from pipeline.records import FloatArray, Image
 from pipeline.techniques.base import NavContext
-from pipeline.techniques.ring_solve import PIXEL_VARIANCE
+from pipeline.techniques.ring_unknowns import PIXEL_VARIANCE
 
 # Side, in pixels of the coarse level, to which an image is reduced.
 _COARSE_SIDE, _COARSE_SIDE_TURNED = 256, 128

@@ -28,8 +28,10 @@ _TRIALS = {2: 30, 3: 60}
 _SEEN, _COARSER = 0.8, 4.0
 # Pixels that count at most, of the lattice's 16 000.
 _MOST_INDEPENDENT = 4_000.0
-# Change of log-likelihood that ends a descent, and by which a place is so much worse that no fit brings it back.
-_SETTLED_GAIN, _BEYOND_HOPE = 0.2, 25.0
+# Change of log-likelihood that ends a descent.
+_SETTLED_GAIN = 0.2
+# Log-likelihood by which a place is so much worse than another that no fit brings it back.
+BEYOND_HOPE = 25.0
 # How far beyond the margin a place is followed, and the logarithm of what is left over farther out.
 _BEYOND_MARGIN_PX, _OUTSIDE = 2.0, 50.0
 # Places nearer to each other than this, in pixels at the image's centre and border, are one.
@@ -91,7 +93,7 @@ def likely_places(
         if not any(_same(place.peak, known.peak, context) for known in places):
             places.append(place)
     places.sort(key=lambda place: place.left)
-    return [place for place in places if worse_by(image, place.left, places[0].left) < _BEYOND_HOPE]
+    return [place for place in places if worse_by(image, place.left, places[0].left) < BEYOND_HOPE]
 
 
 def worse_by(image: RingImage, left: float, best: float) -> float:

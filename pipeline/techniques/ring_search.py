@@ -17,7 +17,14 @@ from pipeline.techniques.ring_bands import LeftOver, left_over
 from pipeline.techniques.ring_fit import RingFit, fit_rings
 from pipeline.techniques.ring_image import Lattice, RingImage
 from pipeline.techniques.ring_peaks import Peak, RingSearchOptions, find_peaks
-from pipeline.techniques.ring_places import Place, independent_pixels, likely_places, turned_place, worse_by
+from pipeline.techniques.ring_places import (
+    BEYOND_HOPE,
+    Place,
+    independent_pixels,
+    likely_places,
+    turned_place,
+    worse_by,
+)
 
 # Log-likelihood by which a fit elsewhere may be worse than the place that it started from.
 _ASTRAY = 10.0
@@ -94,7 +101,7 @@ def find_rings(
         return found.problem
     fit, place = found.fits[0]
     turned = turned_place(scene, image, fit, place.peak.correlation, context)
-    if turned is not None:
+    if turned is not None and worse_by(image, turned.left, _as_seen(scene, image.lattice, fit)[1].mean) < BEYOND_HOPE:
         found = found.with_others(_fitted(scene, image, [turned], context))
     return _judged(scene, image, found, context)
 

@@ -1,214 +1,26 @@
-"""Equations of ring edges in common parameters: offset, rotation, blur, and errors of features' and edges' radii."""
+"""Equations of pieces of ring edges, put together in the unknowns of a fit, and solved."""
 
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from pipeline.geometry.rotations import plane_rotation_derivative
 from pipeline.imaging.ring_light import MOST_EDGES, assemble
-from pipeline.predict.rings import RingScene
-from pipeline.records import BoolArray, FloatArray
-from pipeline.techniques.base import NavContext
+from pipeline.records import FloatArray
 from pipeline.techniques.lm import tukey_weight
 from pipeline.techniques.ring_units import RingUnits
+from pipeline.techniques.ring_unknowns import Layout, Levers, Radii
 
-# A pixel integrates over its square: as much variance, in square pixels, on each axis.
-PIXEL_VARIANCE = 1.0 / 12.0
 # Prior of the blur's variance, relative to itself.
 _WIDTH_SHARE = 0.3
 # A feature is left out from so many sigmas on, if also by so many pixels, and if enough others agree.
 _OUTLIER_SIGMAS, _LEAST_OTHERS, _LEAST_TROUBLE_PX = 4.0, 2, 0.25
-# Wrong wings, widths and geometry move also edges of rings whose light does not depend on the optical depth; and a
-# predicted contrast of nearly nothing is not to be believed.
-_LEAST_UNEVEN, _MOST_UNEVEN = 0.15, 4.0
 # Degrees of freedom from which on a unit's residuals tell the noise.
 _SOUND_FREEDOM = 10.0
-# Relative unevenness of rings over the width of a blur, before an image has told its own: Saturn's A and B rings
-# scatter by a tenth and more from pixel to pixel in images that resolve them.
-USUAL_TEXTURE = 0.1
-# A perfect catalogue is one whose errors no pixel shows; a free radius has this share of its prior's weight.
-_PERFECT_PX, _FREE = 1e-4, 1e-12
+# A free radius has this share of its prior's weight.
+_FREE = 1e-12
 # Standard deviation over median absolute value of a normal variable.
 _MEDIAN_TO_SIGMA = 1.4826
 _TINY = 1e-12
-
-
-@dataclass(frozen=True, eq=False)
-class Layout:
-    """Order of the parameters: (dv, du[, theta], blur variance, features' radii in km, edges' shifts in px).
-
-    Attributes
-    ----------
-    size
-        2 or 3.
-    used
-        (m,) features of the scene, by their index in the system.
-    column
-        (edges,) which of them each edge belongs to.
-    blur2
-        Variance of the blur, px^2.
-    km_per_px
-        At the planet's distance.
-    texture_px
-        (edges,) shift of each edge per relative unevenness of its rings, see :mod:`pipeline.techniques.ring_texture`.
-    bounds
-        (size,) margin in pixels and largest rotation, which keep a step short where edges do not show it.
-    """
-
-    size: int
-    used: NDArray[np.int64]
-    column: NDArray[np.int64]
-    blur2: float
-    km_per_px: float
-    texture_px: FloatArray
-    bounds: FloatArray
-
-    @property
-    def features(self) -> int:
-        """Number of features in use."""
-        return len(self.used)
-
-    @property
-    def count(self) -> int:
-        """Number of parameters."""
-        return self.size + 1 + self.features + len(self.column)
-
-    @property
-    def radii(self) -> slice:
-        """Where the errors of features and edges are."""
-        return slice(self.size + 1, None)
-
-
-def layout_of(scene: RingScene, context: NavContext) -> Layout:
-    """Parameters of a scene.
-
-    Parameters
-    ----------
-    scene
-        Edges.
-    context
-        Bounds.
-
-    Returns
-    -------
-    Layout
-        For all rounds of a fit.
-    """
-    camera, rings = scene.state.camera_model, scene.rings
-    assert rings is not None
-    scale = camera.focal_length_mm * np.sqrt(abs(np.linalg.det(camera.k_px_per_mm)))
-    used = np.unique(scene.feature)
-    bounds = [*context.search_margin_vu, *([context.max_rotation_rad] if context.fit_camera_rotation else [])]
-    blur2 = scene.sigma_px**2 + PIXEL_VARIANCE
-    return Layout(
-        len(bounds), used, np.searchsorted(used, scene.feature).astype(np.int64), blur2,
-        float(np.linalg.norm(rings.position_km) / scale), texture_shift(scene.unevenness, blur2), np.array(bounds),
-    )  # fmt: skip
-
-
-def texture_shift(unevenness: FloatArray, blur2: float) -> FloatArray:
-    """Shift of edges per relative unevenness of the optical depth beside them.
-
-    Light that is off by a share of the contrast over the width of the blur moves a blurred step by that share of it.
-
-    Parameters
-    ----------
-    unevenness
-        (n,) of :class:`pipeline.predict.rings.RingScene`.
-    blur2
-        Variance of the blur, px^2.
-
-    Returns
-    -------
-    numpy.ndarray
-        (n,) pixels.
-    """
-    return np.asarray(np.sqrt(blur2) * np.hypot(np.minimum(unevenness, _MOST_UNEVEN), _LEAST_UNEVEN))
-
-
-@dataclass(frozen=True, eq=False)
-class Radii:
-    """Unknown errors: radii of the scene's features in km, then shifts of its edges alone in pixels.
-
-    An edge alone is off where its blur, or light beside it, is not what a step has.
-
-    Attributes
-    ----------
-    values, sigma
-        (features + edges,) and what is believed of them.
-    free
-        (features + edges,) True where nothing is.
-    along
-        (edges,) variance of single pieces along an edge, px^2.
-    wild
-        (edges,) factor on the variance of edges that are off by more than usual.
-    """
-
-    values: FloatArray
-    sigma: FloatArray
-    free: BoolArray
-    along: FloatArray
-    wild: FloatArray
-
-
-def first_radii(scene: RingScene, layout: Layout) -> Radii:
-    """No errors yet, catalogue's sigmas."""
-    first = np.unique(scene.feature, return_index=True)[1]
-    known = np.maximum(scene.sigma_km[first], _PERFECT_PX * layout.km_per_px)
-    sigma = np.concatenate([known, USUAL_TEXTURE * layout.texture_px])
-    return Radii(np.zeros(len(sigma)), sigma, np.zeros(len(sigma), bool), np.zeros(len(scene)), np.ones(len(scene)))
-
-
-@dataclass(frozen=True, eq=False)
-class Levers:
-    """How the parameters move the units' edges.
-
-    Attributes
-    ----------
-    normal, lever, scale
-        (n, 10, 2), (n, 10), (n, 10): pixels per pixel, per radian, per kilometre; zero where a unit has no such edge.
-    edges
-        (n, 2) as of the units.
-    """
-
-    normal: FloatArray
-    lever: FloatArray
-    scale: FloatArray
-    edges: NDArray[np.int64]
-
-
-def levers_of(units: RingUnits, pivot_vu: FloatArray) -> Levers:
-    """Derivatives of the units' shifts.
-
-    Parameters
-    ----------
-    units
-        Pieces of edges.
-    pivot_vu
-        (2,) centre of the rotation.
-
-    Returns
-    -------
-    Levers
-        At the units' middles.
-    """
-    arm = (units.places_vu - pivot_vu) @ plane_rotation_derivative(0.0).T
-    lever = (arm * units.normal_vu).sum(axis=2) * units.present
-    return Levers(
-        units.normal_vu * units.present[:, :, None], lever, units.px_per_km * units.present, units.edges.copy()
-    )
-
-
-def shifts_of(levers: Levers, layout: Layout, values: FloatArray) -> FloatArray:
-    """(n, 10) shifts of the units' edges by parameters, pixels."""
-    shifts = levers.normal @ values[:2]
-    if layout.size == 3:
-        shifts += levers.lever * values[2]
-    edge = np.minimum(levers.edges[:, :1] + np.arange(MOST_EDGES), len(layout.column) - 1)
-    errors = values[layout.radii]
-    own = errors[layout.features + edge] * (levers.scale > 0)
-    return np.asarray(shifts + levers.scale * errors[layout.column[edge]] + own)
 
 
 @dataclass(frozen=True, eq=False)
@@ -326,8 +138,8 @@ def system_of(
     """
     gram, pull = np.zeros((layout.count, layout.count)), np.zeros(layout.count)
     assemble(
-        equations.gram, equations.pull, weight, levers.normal, levers.lever, levers.scale, levers.edges, layout.column,
-        layout.size, layout.features, gram, pull,
+        equations.gram, equations.pull, weight, levers.normal, levers.lever, levers.scale, levers.way, levers.edges,
+        layout.column, layout.size, layout.features, gram, pull,
     )  # fmt: skip
     return System((gram + gram.T) / 2, pull, values)
 
@@ -390,7 +202,8 @@ def without_outlier(system: System, layout: Layout, radii: Radii, px_per_km: Flo
     count = layout.features
     if count <= _LEAST_OTHERS:
         return radii
-    wide = np.concatenate([radii.sigma[:count], texture * layout.texture_px * np.sqrt(radii.wild)])
+    wide = radii.sigma.copy()
+    wide[layout.shifts] = texture * layout.texture_px * np.sqrt(radii.wild)
     believed = replace(radii, sigma=wide)
     gap, ratio = _against_others(system, layout, believed)
     worst = int(np.argmax(ratio))

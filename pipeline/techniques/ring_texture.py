@@ -12,18 +12,9 @@ from numpy.typing import NDArray
 
 from pipeline.imaging.ring_light import MOST_EDGES
 from pipeline.records import FloatArray
-from pipeline.techniques.ring_solve import (
-    USUAL_TEXTURE,
-    Equations,
-    Layout,
-    Radii,
-    System,
-    inverse_of,
-    own_shifts,
-    prior_of,
-    told_size,
-)
+from pipeline.techniques.ring_solve import Equations, System, inverse_of, own_shifts, prior_of, told_size
 from pipeline.techniques.ring_units import RingUnits
+from pipeline.techniques.ring_unknowns import USUAL_TEXTURE, Layout, Radii
 
 # Width (natural logarithm) of the prior of the rings' unevenness, and its grid.
 _TEXTURE_WIDTH = 0.7
@@ -58,22 +49,23 @@ def edge_scatter(system: System, layout: Layout, radii: Radii) -> tuple[Radii, f
     tuple
         Radii with the edges' sigma renewed; the unevenness.
     """
-    first = layout.size + 1 + layout.features
+    edges = np.arange(layout.count)[layout.radii][layout.shifts]
+    others = np.setdiff1d(np.arange(layout.count), edges)
     prior = prior_of(layout, radii, False)
     prior[: layout.size] = 1.0 / layout.bounds**2
     # About errors of zero, not about the present ones, whose prior is left out.
-    prior[first:] = 0.0
+    prior[edges] = 0.0
     own = system.values.copy()
-    own[:first] = 0.0
+    own[others] = 0.0
     target = prior * system.values
     target[: layout.size] = 0.0
     pull = system.pull - target + system.gram @ own
     gram = system.gram + np.diag(prior + 1e-12 * np.diag(system.gram) + 1e-300)
-    inner = inverse_of(gram[:first, :first])
-    cross = gram[first:, :first]
+    inner = inverse_of(gram[np.ix_(others, others)])
+    cross = gram[np.ix_(edges, others)]
     scale = layout.texture_px * np.sqrt(radii.wild)
-    block = (gram[first:, first:] - cross @ inner @ cross.T) * np.outer(scale, scale)
-    told = (pull[first:] - cross @ (inner @ pull[:first])) * scale
+    block = (gram[np.ix_(edges, edges)] - cross @ inner @ cross.T) * np.outer(scale, scale)
+    told = (pull[edges] - cross @ (inner @ pull[others])) * scale
     strength, vectors = np.linalg.eigh((block + block.T) / 2)
     strength, along = np.maximum(strength, 0.0), vectors.T @ told
     grid = _TEXTURES[:, None]
@@ -86,7 +78,7 @@ def edge_scatter(system: System, layout: Layout, radii: Radii) -> tuple[Radii, f
     power = (error**2 + (vectors**2) @ posterior) * radii.wild / texture**2
     wild = np.clip((_TAIL + power) / (_TAIL + 1.0), 1.0, _WILDEST)
     sigma = radii.sigma.copy()
-    sigma[layout.features :] = np.minimum(texture * layout.texture_px * np.sqrt(wild), np.sqrt(layout.blur2))
+    sigma[layout.shifts] = np.minimum(texture * layout.texture_px * np.sqrt(wild), np.sqrt(layout.blur2))
     return replace(radii, sigma=sigma, wild=wild), texture
 
 
@@ -178,7 +170,7 @@ def change_along(equations: Equations, units: RingUnits, layout: Layout, radii: 
     order = np.lexsort((units.longitude_rad[row], edge))
     row, column, edge = row[order], column[order], edge[order]
     count = len(layout.column)
-    usual = (_ALONG_SHARE * radii.sigma[layout.features :]) ** 2 / radii.wild
+    usual = (_ALONG_SHARE * radii.sigma[layout.shifts]) ** 2 / radii.wild
     excess, weights = np.zeros(count), np.zeros(count)
     for k in np.unique(edge):
         mine = edge == k

@@ -3,7 +3,8 @@
 import numpy as np
 
 from pipeline.records import FloatArray
-from pipeline.techniques.ring_solve import Layout, Radii, System, without_outlier
+from pipeline.techniques.ring_solve import System, without_outlier
+from pipeline.techniques.ring_unknowns import Layout, Radii
 
 _OFFSET = np.array([0.7, -1.2])
 
@@ -18,8 +19,8 @@ def _layout(count: int) -> Layout:
 
 
 def _radii(count: int, sigma_km: float) -> Radii:
-    sigma = np.concatenate([np.full(count, sigma_km), np.full(count, 0.01)])
-    return Radii(np.zeros(2 * count), sigma, np.zeros(2 * count, bool), np.zeros(count), np.ones(count))
+    sigma = np.concatenate([np.full(count, sigma_km), np.full(count, 0.01), np.full(count, 1e-4)])
+    return Radii(np.zeros(3 * count), sigma, np.zeros(3 * count, bool), np.zeros(count), np.ones(count))
 
 
 def _system(layout: Layout, shifts_px: FloatArray, sigma_px: float = 0.02) -> System:
