@@ -102,8 +102,8 @@ class RingFit(Record):
         Variance of the units' shifts over what noise allows.
     chi2_per_pixel
         Median of the units.
-    pixels, stride
-        Pixels in the fit; pixels of the image for one of these.
+    pixels
+        Pixels in the fit.
     width_px2
         Change of the blur's variance.
     significance
@@ -126,7 +126,6 @@ class RingFit(Record):
     excess: float
     chi2_per_pixel: float
     pixels: int
-    stride: int
     width_px2: float
     significance: float
 
@@ -172,9 +171,8 @@ class _Job:
 
 
 def fit_rings(
-    scene: RingScene, image: RingImage, start: tuple[FloatArray, float] | RingFit, context: NavContext, tied: bool,
-    most_pixels: int,
-) -> RingFit | str:  # fmt: skip
+    scene: RingScene, image: RingImage, start: tuple[FloatArray, float] | RingFit, context: NavContext, tied: bool
+) -> RingFit | str:
     """Fit all edges from a start that is right to a pixel or two.
 
     Parameters
@@ -184,13 +182,11 @@ def fit_rings(
     image
         Light and noise.
     start
-        (2,) offset at the array centre and rotation; or a fit with fewer pixels or free contrasts.
+        (2,) offset at the array centre and rotation; or a fit with free contrasts.
     context
         Bounds.
     tied
         Whether a unit's contrasts are one multiple of the predicted ones (a template) or all free.
-    most_pixels
-        Pixels beyond which a lattice of them is used.
 
     Returns
     -------
@@ -204,7 +200,7 @@ def fit_rings(
     # From a fit's place edges are within their blur at once.
     turn = int(isinstance(start, RingFit))
     units: RingUnits | None = None
-    flat, stride = np.zeros(0, np.int64), 1
+    flat = np.zeros(0, np.int64)
     wandered = np.inf
     while turn < _ROUNDS:
         pose = scene.pose(now.offset_vu, now.rotation_rad)
@@ -213,8 +209,7 @@ def fit_rings(
             if units is None or not len(units):
                 return "no edge is inside the array"
         if wandered > _RENEWED_PX:
-            flat, stride = select_pixels(scene, image, pose, job.reach_px, most_pixels)
-            wandered = 0.0
+            flat, wandered = select_pixels(scene, image, pose, job.reach_px), 0.0
         if not tied and (units.present[:, 1:] & ~_apart(units, job.near_px)).any():
             # Near edges share a step in the ratio of their contrasts: better measured than predicted.
             told = left_over(scene, image.lattice, now.offset_vu, now.rotation_rad)
@@ -235,7 +230,7 @@ def fit_rings(
         return "no edge is inside the array"
     if now.moved_sigmas > _LOST_SIGMAS and now.moved_px > _RENEWED_PX:
         return "the fit did not settle"
-    return replace(now.fit, offset_vu=now.offset_vu, rotation_rad=now.rotation_rad, units=units, stride=stride)
+    return replace(now.fit, offset_vu=now.offset_vu, rotation_rad=now.rotation_rad, units=units)
 
 
 def _inside(now: _Round, context: NavContext) -> bool:
@@ -383,7 +378,7 @@ def _concluded(
     figure = float(np.median(equations.fit[some, 0] / equations.freedom[some])) if some.any() else np.nan
     fit = RingFit(
         np.zeros(2), 0.0, pivot, marginal(total, size), radius, sigma, edge_km, excluded, units, shift,
-        shift_sigma, weight, equations.fit[:, 3:], excess, figure, int(equations.fit[:, 1].sum()), 1,
+        shift_sigma, weight, equations.fit[:, 3:], excess, figure, int(equations.fit[:, 1].sum()),
         float(values[size]), float((equations.fit[:, 2] * (weight > 0)).sum()),
     )  # fmt: skip
     return fit, radii

@@ -51,23 +51,14 @@ class RingImage:
         (rows, cols) DN^2, of each pixel by its neighbourhood's level, which its own noise hardly moves.
     lattice
         Some 16 000 pixels.
+    enough_pixels
+        Pixels from which on texture, not noise, limits a fit of many edges; few for clean images.
     """
 
     frame: Frame
     variance: Image
     lattice: Lattice
-
-    @property
-    def enough_pixels(self) -> int:
-        """Pixels from which on texture, not noise, limits a fit of many edges; few for clean images."""
-        good = self.lattice.weight > 0
-        if not good.any():
-            return _MOST_PIXELS
-        # Of the middle of the light: a planet in a corner says nothing of the rings.
-        low, high = np.quantile(self.lattice.data[good], (0.1, 0.9))
-        snr = float(high - low) * float(np.sqrt(np.median(self.lattice.weight[good])))
-        wanted = _ENOUGH_PIXELS * (_ENOUGH_SNR / max(snr, 1e-3)) ** 2
-        return int(np.clip(wanted, _ENOUGH_PIXELS, _MOST_PIXELS))
+    enough_pixels: int
 
 
 def ring_image(frame: Frame) -> RingImage:
@@ -85,7 +76,18 @@ def ring_image(frame: Frame) -> RingImage:
     """
     smooth = np.asarray(cv2.blur(frame.raw, (3, 3)), np.float32)
     variance = np.asarray(frame.noise.variance(smooth), np.float32)
-    return RingImage(frame, variance, _lattice(frame, variance))
+    lattice = _lattice(frame, variance)
+    return RingImage(frame, variance, lattice, _enough_pixels(lattice))
+
+
+def _enough_pixels(lattice: Lattice) -> int:
+    good = lattice.weight > 0
+    if not good.any():
+        return _MOST_PIXELS
+    # Of the middle of the light: a planet in a corner says nothing of the rings.
+    low, high = np.quantile(lattice.data[good], (0.1, 0.9))
+    snr = float(high - low) * float(np.sqrt(np.median(lattice.weight[good])))
+    return int(np.clip(_ENOUGH_PIXELS * (_ENOUGH_SNR / max(snr, 1e-3)) ** 2, _ENOUGH_PIXELS, _MOST_PIXELS))
 
 
 def _lattice(frame: Frame, variance: Image) -> Lattice:

@@ -36,9 +36,7 @@ class EdgePixels:
     starts: NDArray[np.int64]
 
 
-def select_pixels(
-    scene: RingScene, image: RingImage, pose: RingPose, reach_px: float, most_pixels: int
-) -> tuple[NDArray[np.int64], int]:
+def select_pixels(scene: RingScene, image: RingImage, pose: RingPose, reach_px: float) -> NDArray[np.int64]:
     """Good pixels near edges, on a lattice where there are very many.
 
     Parameters
@@ -49,19 +47,16 @@ def select_pixels(
         Pointing.
     reach_px
         Distance from an edge up to which pixels are used.
-    most_pixels
-        Pixels that are enough.
 
     Returns
     -------
-    tuple
-        (n,) indices of the flattened image; pixels of the image for one of these.
+    numpy.ndarray
+        (n,) indices of the flattened image.
     """
     estimate = len(_near(scene, image, pose, reach_px, *_LATTICES[-1])) * _LATTICES[-1][0]
-    enough = [lattice for lattice in _LATTICES if estimate <= most_pixels * lattice[0]]
-    stride, slant = (enough or _LATTICES[-1:])[0]
-    flat = _near(scene, image, pose, reach_px, stride, slant)
-    return np.ascontiguousarray(flat[~image.frame.bad.ravel()[flat]]), stride
+    enough = [lattice for lattice in _LATTICES if estimate <= image.enough_pixels * lattice[0]]
+    flat = _near(scene, image, pose, reach_px, *(enough or _LATTICES[-1:])[0])
+    return np.ascontiguousarray(flat[~image.frame.bad.ravel()[flat]])
 
 
 def _near(

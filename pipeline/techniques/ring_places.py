@@ -156,37 +156,48 @@ def settled_place(
     Place
         Nearest minimum, found by a simplex (Nelder and Mead 1965) under a blur that narrows.
     """
-    arm = float(np.hypot(*context.camera_model.shape_vu)) / 3.0
-    size = 3 if context.max_rotation_rad else 2
-    margin = np.array(context.search_margin_vu) + _BEYOND_MARGIN_PX
-    coarse = image.lattice.halved()
-
-    def at(values: NDArray[np.float64]) -> Peak:
-        turn = float(values[2]) / arm if size == 3 else 0.0
-        moved = (peak.offset_vu[0] + float(values[0]), peak.offset_vu[1] + float(values[1]))
-        return replace(peak, offset_vu=moved, rotation_rad=peak.rotation_rad + turn)
-
-    def cost(values: NDArray[np.float64], slack: float) -> float:
-        here = at(values)
-        if (np.abs(here.offset_vu) > margin).any() or abs(here.rotation_rad) > 1.05 * context.max_rotation_rad + 1e-9:
-            return _OUTSIDE
-        return float(np.log(_cost(_bands(scene, coarse, here, slack), in_sight / _COARSER)))
-
-    best = np.zeros(size)
-    pixels = float((coarse.weight > 0).sum())
-    for slack, step in _STAGES:
-        now = cost(best, slack)
-        enough = 2.0 * _SETTLED_GAIN / independent_pixels(pixels, float(np.exp(now)))
-        simplex = best + step * np.vstack([np.zeros(size), np.eye(size)])
-        found = minimize(
-            cost, best, (slack,), method="Nelder-Mead",
-            options={"initial_simplex": simplex, "xatol": 0.05, "fatol": enough, "maxfev": _TRIALS[size]},
-        )  # fmt: skip
-        best = np.asarray(found.x)
-    start, end = (
-        Place(one, _cost(_bands(scene, image.lattice, one, 0.0), in_sight), True) for one in (peak, at(best))
-    )
+    moved = _Descent(scene, image.lattice.halved(), peak, in_sight / _COARSER, context).lowest()
+    start, end = (Place(one, _cost(_bands(scene, image.lattice, one, 0.0), in_sight), True) for one in (peak, moved))
     return min(start, end, key=lambda place: place.left)
+
+
+@dataclass(frozen=True, eq=False)
+class _Descent:
+    """From a peak to the least left over, in pixels of offset and, some way from the centre, of rotation."""
+
+    scene: RingScene
+    lattice: Lattice
+    peak: Peak
+    in_sight: float
+    context: NavContext
+
+    def lowest(self) -> Peak:
+        size = 3 if self.context.max_rotation_rad else 2
+        pixels = float((self.lattice.weight > 0).sum())
+        best = np.zeros(size)
+        for slack, step in _STAGES:
+            now = float(np.exp(self.cost(best, slack)))
+            enough = 2.0 * _SETTLED_GAIN / independent_pixels(pixels, now)
+            simplex = best + step * np.vstack([np.zeros(size), np.eye(size)])
+            found = minimize(
+                self.cost, best, (slack,), method="Nelder-Mead",
+                options={"initial_simplex": simplex, "xatol": 0.05, "fatol": enough, "maxfev": _TRIALS[size]},
+            )  # fmt: skip
+            best = np.asarray(found.x)
+        return self.at(best)
+
+    def at(self, values: NDArray[np.float64]) -> Peak:
+        arm = float(np.hypot(*self.context.camera_model.shape_vu)) / 3.0
+        turn = float(values[2]) / arm if len(values) == 3 else 0.0
+        moved = (self.peak.offset_vu[0] + float(values[0]), self.peak.offset_vu[1] + float(values[1]))
+        return replace(self.peak, offset_vu=moved, rotation_rad=self.peak.rotation_rad + turn)
+
+    def cost(self, values: NDArray[np.float64], slack_px: float) -> float:
+        here, bound = self.at(values), 1.05 * self.context.max_rotation_rad + 1e-9
+        margin = np.array(self.context.search_margin_vu) + _BEYOND_MARGIN_PX
+        if (np.abs(here.offset_vu) > margin).any() or abs(here.rotation_rad) > bound:
+            return _OUTSIDE
+        return float(np.log(_cost(_bands(self.scene, self.lattice, here, slack_px), self.in_sight)))
 
 
 def turned_place(

@@ -119,14 +119,14 @@ class _Found:
 
 
 def _fitted(scene: RingScene, image: RingImage, places: list[Place], context: NavContext) -> _Found:
-    found, enough = _Found([], [], ""), image.enough_pixels
+    found = _Found([], [], "")
     for place in places:
         peak = place.peak
         # Places on one ridge run to the same one.
         if any(_same(scene, fit, peak) for fit, _ in found.fits):
             continue
         start = (np.array(peak.offset_vu), peak.rotation_rad)
-        fit = fit_rings(scene, image, start, context, False, enough)
+        fit = fit_rings(scene, image, start, context, False)
         if isinstance(fit, RingFit) and place.settled:
             _, seen = _as_seen(scene, image.lattice, fit)
             if not _same(scene, fit, peak) and worse_by(image, seen.mean, place.left) > _ASTRAY:

@@ -88,10 +88,8 @@ def test_worse_by_is_no_difference_at_the_same_place() -> None:
 def test_a_lattice_is_a_part_of_all_pixels_near_edges() -> None:
     scene, image, _ = _setting(30.0, False)
     pose = scene.pose(np.array(_TRUTH), 0.0)
-    every, stride = select_pixels(scene, image, pose, 4.0, 10**6)
-    assert stride == 1
-    some, stride = select_pixels(scene, image, pose, 4.0, len(every) // 4)
-    assert stride == 5
+    every = select_pixels(scene, image, pose, 4.0)
+    some = select_pixels(scene, replace(image, enough_pixels=len(every) // 4), pose, 4.0)
     assert set(some.tolist()) <= set(every.tolist())
     assert 0.15 < len(some) / len(every) < 0.25
     v, u = np.divmod(some, image.frame.raw.shape[1])
@@ -99,9 +97,11 @@ def test_a_lattice_is_a_part_of_all_pixels_near_edges() -> None:
 
 
 def test_noise_asks_for_more_pixels() -> None:
-    _, noisy, _ = _setting(2.0, False)
-    _, clean, _ = _setting(30.0, False)
-    # A middle of light of many sigmas, as crowded rings have it.
-    crowded = replace(clean.lattice, data=clean.lattice.data + np.linspace(0.0, 900.0, clean.lattice.data.shape[1]))
-    assert replace(clean, lattice=crowded).enough_pixels == 100_000
-    assert noisy.enough_pixels == 400_000
+    bands = tuple(Band(radius, 12.0, 1.0) for radius in range(100, 330, 24))
+    drawn = (
+        ring_scene(np.random.default_rng(4), bands, RingView(1.2, 0.4, (200.0, 0.8)), _TRUTH, snr=snr)
+        for snr in (2.0, 60.0)
+    )
+    frames = (make_frame(one.pixels, None, one.state, _OPTIONS.frame) for one in drawn)
+    noisy, clean = (ring_image(frame).enough_pixels for frame in frames)
+    assert (noisy, clean) == (400_000, 100_000)
