@@ -51,7 +51,8 @@ def ring_annulus_nav(
         return TechniqueFailure(NAME, StatusReason.NO_FEATURES_DETECTED, fix)
     if fix.confidence < options.min_confidence:
         return TechniqueFailure(NAME, StatusReason.AMBIGUOUS_MATCH, "another place fits nearly as well")
-    fit = fit_rings(scene, image, fix.fit, context, True)
+    start = (fix.fit.offset_vu, fix.fit.rotation_rad)
+    fit = fit_rings(scene, image, start, context, tied=True, close=True)
     if isinstance(fit, str):
         return TechniqueFailure(NAME, StatusReason.NO_MATCH, fit)
     result = ring_result(NAME, scene, fix, fit, context, options, 1)

@@ -52,8 +52,8 @@ _ROUNDS, _INNER = 10, 2
 _SETTLED_PX, _SETTLED_SIGMAS = 0.004, 0.1
 # A last round that still moves it by more than this, in sigmas, has not found its place.
 _LOST_SIGMAS = 1.0
-# Widening of the blur in the first round, to reach edges that are off by a pixel or two.
-_FIRST_WIDENING = 1.5
+# Widening of the blur in the first round, px^2, to reach edges that are off by a pixel or two; and what bands forgive.
+_FIRST_WIDENING, _FIRST_SLACK_PX = 1.5, 1.0
 # From this round on units are doubted: before, the edges have not found their places.
 _DOUBT_FROM = 2
 # A step sharper than the pixels that sample it would stop at the nearest gap between two of them.
@@ -164,14 +164,13 @@ class _Job:
         """Sigma of a blurred step."""
         return float(np.sqrt(self.layout.blur2))
 
-    @property
-    def near_px(self) -> float:
-        """Distance below which edges share a step."""
-        return _ONE_STEP_BLURS * self.blur_px
+    def near_px(self, first: bool) -> float:
+        """Distance below which edges share a step; in the first round the blur is wider."""
+        return _ONE_STEP_BLURS * float(np.sqrt(self.layout.blur2 + first * _FIRST_WIDENING))
 
 
 def fit_rings(
-    scene: RingScene, image: RingImage, start: tuple[FloatArray, float] | RingFit, context: NavContext, tied: bool
+    scene: RingScene, image: RingImage, start: tuple[FloatArray, float], context: NavContext, *, tied: bool, close: bool
 ) -> RingFit | str:
     """Fit all edges from a start that is right to a pixel or two.
 
@@ -182,11 +181,13 @@ def fit_rings(
     image
         Light and noise.
     start
-        (2,) offset at the array centre and rotation; or a fit with free contrasts.
+        (2,) offset at the array centre and rotation.
     context
         Bounds.
     tied
         Whether a unit's contrasts are one multiple of the predicted ones (a template) or all free.
+    close
+        Whether the edges are within their blur already; else the first round's is wider.
 
     Returns
     -------
@@ -194,11 +195,9 @@ def fit_rings(
         Or in one line why there is none.
     """
     job = _Job(scene, image, context, layout_of(scene, context), tied)
-    place, rotation = (start.offset_vu, start.rotation_rad) if isinstance(start, RingFit) else start
     radii = first_radii(scene, job.layout)
-    now = _Round(np.asarray(place, float), rotation, 0.0, radii, np.inf, np.inf, 0, None)
-    # From a fit's place edges are within their blur at once.
-    turn = int(isinstance(start, RingFit))
+    now = _Round(np.asarray(start[0], float), float(start[1]), 0.0, radii, np.inf, np.inf, 0, None)
+    turn = int(close)
     units: RingUnits | None = None
     flat = np.zeros(0, np.int64)
     wandered = np.inf
@@ -210,9 +209,9 @@ def fit_rings(
                 return "no edge is inside the array"
         if wandered > _RENEWED_PX:
             flat, wandered = select_pixels(scene, image, pose, job.reach_px), 0.0
-        if not tied and (units.present[:, 1:] & ~_apart(units, job.near_px)).any():
+        if not tied and (units.present[:, 1:] & ~_apart(units, job.near_px(turn == 0))).any():
             # Near edges share a step in the ratio of their contrasts: better measured than predicted.
-            told = left_over(scene, image.lattice, now.offset_vu, now.rotation_rad)
+            told = left_over(scene, image.lattice, now.offset_vu, now.rotation_rad, _FIRST_SLACK_PX * (turn == 0))
             job = replace(job, scene=replace(scene, contrasts=told.contrasts))
         pixels = measured(scene, image, pose, units, flat, job.reach_px, job.blur_px)
         after = _linearised(job, now, units, pixels, turn)
@@ -258,7 +257,7 @@ def _linearised(job: _Job, now: _Round, units: RingUnits, pixels: EdgePixels, tu
     base = np.append(now.offset_vu, now.rotation_rad)[: layout.size]
     values = np.concatenate([np.zeros(layout.size), [_FIRST_WIDENING if first else now.width], now.radii.values])
     for _ in range(_INNER):
-        equations = _equations(job, units, pixels, levers, values)
+        equations = _equations(job, units, pixels, levers, values, first)
         if not (equations.freedom > 0).any():
             return "no edge has enough pixels"
         loose = loosened(equations, units, layout, now.radii)
@@ -270,7 +269,7 @@ def _linearised(job: _Job, now: _Round, units: RingUnits, pixels: EdgePixels, tu
         values = values + step * _shortening(step, levers, layout)
         least = _LEAST_VARIANCE_PX2 - layout.blur2
         values[layout.size] = np.clip(values[layout.size], least, _MOST_WIDENING * layout.blur2)
-    equations = _equations(job, units, pixels, levers, values)
+    equations = _equations(job, units, pixels, levers, values, first)
     if turn >= _DOUBT_FROM:
         weight = unit_weights(loosened(equations, units, layout, now.radii))
     solved = (equations, weight, levers, values)
@@ -298,12 +297,14 @@ def _shortening(step: FloatArray, levers: Levers, layout: Layout) -> float:
     )
 
 
-def _equations(job: _Job, units: RingUnits, pixels: EdgePixels, levers: Levers, values: FloatArray) -> Equations:
+def _equations(
+    job: _Job, units: RingUnits, pixels: EdgePixels, levers: Levers, values: FloatArray, first: bool
+) -> Equations:
     layout = job.layout
     count = len(units)
     gram = np.zeros((count, MOST_EDGES + 1, MOST_EDGES + 1))
     pull, fit = np.zeros((count, MOST_EDGES + 1)), np.zeros((count, 3 + MOST_EDGES))
-    step, share = _steps(units, job.scene.contrasts, job.near_px, job.tied)
+    step, share = _steps(units, job.scene.contrasts, job.near_px(first), job.tied)
     unit_equations(
         pixels.data, pixels.variance, pixels.distance, pixels.starts, units.edges, shifts_of(levers, layout, values),
         float(np.sqrt(layout.blur2 + values[layout.size])), step, share, job.image.lattice.amplitude, gram, pull, fit,

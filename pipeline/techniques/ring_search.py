@@ -126,7 +126,7 @@ def _fitted(scene: RingScene, image: RingImage, places: list[Place], context: Na
         if any(_same(scene, fit, peak) for fit, _ in found.fits):
             continue
         start = (np.array(peak.offset_vu), peak.rotation_rad)
-        fit = fit_rings(scene, image, start, context, False)
+        fit = fit_rings(scene, image, start, context, tied=False, close=place.settled)
         if isinstance(fit, RingFit) and place.settled:
             _, seen = _as_seen(scene, image.lattice, fit)
             if not _same(scene, fit, peak) and worse_by(image, seen.mean, place.left) > _ASTRAY:
