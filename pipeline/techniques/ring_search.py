@@ -192,12 +192,17 @@ def _as_seen(scene: RingScene, lattice: Lattice, fit: RingFit) -> tuple[RingScen
     return scenes[best], left[best]
 
 
+def _across(fit: RingFit) -> FloatArray:
+    """(2,) direction in which most of the edges are crossed; what is known best may be another, by errors of radii."""
+    normals = fit.units.normal_vu[fit.units.present]
+    return np.asarray(np.linalg.eigh(normals.T @ normals)[1][:, -1])
+
+
 def _scan(
     scene: RingScene, lattice: Lattice, fit: RingFit, best: LeftOver, count: float
 ) -> list[tuple[float, float]]:
     """Log-likelihood gaps and shifts of the dips on a walk across the edges."""
-    values, vectors = np.linalg.eigh(fit.information[:2, :2])
-    across = vectors[:, int(np.argmax(values))]
+    across = _across(fit)
     shifts = np.arange(-_SCAN_PX, _SCAN_PX + 1).astype(float)
     left = [left_over(scene, lattice, fit.offset_vu + s * across, fit.rotation_rad) for s in shifts]
     mean = np.array([value.mean for value in left])
@@ -210,8 +215,7 @@ def _elsewhere(
     scene: RingScene, lattice: Lattice, fit: RingFit, count: float, context: NavContext
 ) -> list[tuple[float, float]]:
     """Gaps and shifts of places all over the margin, across the edges: what any place explains of a textured image."""
-    values, vectors = np.linalg.eigh(fit.information[:2, :2])
-    across = vectors[:, int(np.argmax(values))]
+    across = _across(fit)
     reach = float(np.min(np.asarray(context.search_margin_vu) / np.maximum(np.abs(across), 1e-9)))
     middle = float(across @ fit.offset_vu)
     shifts = np.linspace(-reach, reach, _PLACES_ELSEWHERE) - middle
