@@ -26,8 +26,8 @@ _STAGES = ((3.0, 4.0), (1.0, 1.5), (0.0, 0.5))
 _TRIALS = {2: 30, 3: 60}
 # Share of the pixels in sight that a place may lose to bodies without a penalty; pixels per one of the coarser lattice.
 _SEEN, _COARSER = 0.8, 4.0
-# Pixels that count at most, of the lattice's 16 000.
-_MOST_INDEPENDENT = 4_000.0
+# Pixels that count at most where places are compared, of the lattice's 16 000.
+_MOST_TELLING = 4_000.0
 # Change of log-likelihood that ends a descent.
 _SETTLED_GAIN = 0.2
 # Log-likelihood by which a place is so much worse than another that no fit brings it back.
@@ -111,14 +111,14 @@ def worse_by(image: RingImage, left: float, best: float) -> float:
     float
         Negative where it is better.
     """
-    return 0.5 * independent_pixels(float((image.lattice.weight > 0).sum()), best) * float(np.log(left / best))
+    return 0.5 * telling_pixels(float((image.lattice.weight > 0).sum()), best) * float(np.log(left / best))
 
 
 def independent_pixels(pixels: float, mean: float) -> float:
     """Pixels of a lattice that err on their own.
 
     Residuals beyond the noise are texture, which is coherent along the rings; across them a lattice has as many lines
-    as its root has pixels. And where noise is all that is left, brightness that changes along the rings is in it.
+    as its root has pixels.
 
     Parameters
     ----------
@@ -132,7 +132,23 @@ def independent_pixels(pixels: float, mean: float) -> float:
     float
         At most all of them.
     """
-    return max(min(pixels, _MOST_INDEPENDENT) / max(1.0, mean), float(np.sqrt(pixels)))
+    return max(pixels / max(1.0, mean), float(np.sqrt(pixels)))
+
+
+def telling_pixels(pixels: float, mean: float) -> float:
+    """Pixels that tell places of rings from each other: brightness that changes along the rings errs in all of them.
+
+    Parameters
+    ----------
+    pixels, mean
+        As of :func:`independent_pixels`.
+
+    Returns
+    -------
+    float
+        Of these a few thousand at most.
+    """
+    return min(independent_pixels(pixels, mean), _MOST_TELLING)
 
 
 def settled_place(
@@ -177,7 +193,7 @@ class _Descent:
         best = np.zeros(size)
         for slack, step in _STAGES:
             now = float(np.exp(self.cost(best, slack)))
-            enough = 2.0 * _SETTLED_GAIN / independent_pixels(pixels, now)
+            enough = 2.0 * _SETTLED_GAIN / telling_pixels(pixels, now)
             simplex = best + step * np.vstack([np.zeros(size), np.eye(size)])
             found = minimize(
                 self.cost, best, (slack,), method="Nelder-Mead",

@@ -22,6 +22,7 @@ from pipeline.techniques.ring_places import (
     Place,
     independent_pixels,
     likely_places,
+    telling_pixels,
     turned_place,
     worse_by,
 )
@@ -159,7 +160,7 @@ def _judged(scene: RingScene, image: RingImage, found: _Found, context: NavConte
     order = np.argsort([value.mean for value in left])
     fit, place = fits[int(order[0])]
     true, best = seen[int(order[0])]
-    count = independent_pixels(best.pixels, best.mean)
+    count = telling_pixels(best.pixels, best.mean)
     gaps = [
         (_gap(left[int(k)].mean, best, count), np.nan)
         for k in order[1:]
@@ -168,7 +169,7 @@ def _judged(scene: RingScene, image: RingImage, found: _Found, context: NavConte
     gaps += [(_gap(rival.left, best, count), np.nan) for rival in found.lost if not _same(scene, fit, rival.peak)]
     gaps += _scan(true, lattice, fit, best, count) + _elsewhere(true, lattice.halved(), fit, count, context)
     tries = float(np.prod([2.0 * m + 1.0 for m in context.search_margin_vu]))
-    gain = 0.5 * count * np.log(best.bare / best.mean)
+    gain = 0.5 * independent_pixels(best.pixels, best.mean) * np.log(best.bare / best.mean)
     doubt = tries * float(np.exp(np.clip(len(scene) + 3.0 - gain, -700.0, 50.0)))
     doubt += sum(float(np.exp(-np.clip(gap, 0.0, 700.0))) for gap, _ in gaps)
     rival = min(gaps, key=lambda entry: entry[0], default=(np.inf, np.nan))

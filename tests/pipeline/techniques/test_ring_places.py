@@ -13,7 +13,13 @@ from pipeline.techniques.ring_bands import left_over
 from pipeline.techniques.ring_image import RingImage, ring_image
 from pipeline.techniques.ring_peaks import Peak
 from pipeline.techniques.ring_pixels import select_pixels
-from pipeline.techniques.ring_places import independent_pixels, likely_places, settled_place, worse_by
+from pipeline.techniques.ring_places import (
+    independent_pixels,
+    likely_places,
+    settled_place,
+    telling_pixels,
+    worse_by,
+)
 from tests.scenes.ring_scene import Band, RingView, ring_scene
 
 _TRUTH = (6.3, -4.8)
@@ -73,10 +79,14 @@ def test_a_peak_without_rivals_stays() -> None:
 
 def test_texture_makes_fewer_pixels_independent() -> None:
     assert independent_pixels(1000.0, 0.9) == 1000.0
-    assert independent_pixels(16_000.0, 1.0) == 4_000.0
-    assert independent_pixels(16_000.0, 10.0) == pytest.approx(400.0)
+    assert independent_pixels(16_000.0, 40.0) == pytest.approx(400.0)
     # Lines across the rings are left however coherent the texture is along them.
     assert independent_pixels(16_000.0, 1e6) == pytest.approx(np.sqrt(16_000.0))
+
+
+def test_places_are_told_by_a_part_of_many_pixels() -> None:
+    assert telling_pixels(16_000.0, 1.0) == 4_000.0
+    assert telling_pixels(16_000.0, 10.0) == pytest.approx(1600.0)
 
 
 def test_worse_by_is_no_difference_at_the_same_place() -> None:
