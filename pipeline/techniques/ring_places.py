@@ -23,7 +23,7 @@ _PEAK_PX = 1.0
 _HOPELESS = 8.0
 # Stages of the descent: wider blur that shows the way from afar, and first steps, both in pixels; most trials.
 _STAGES = ((3.0, 4.0), (1.0, 1.5), (0.0, 0.5))
-_TRIALS = {2: 30, 3: 60}
+_TRIALS = {2: 40, 3: 120}
 # Share of the pixels in sight that a place may lose to bodies without a penalty; pixels per one of the coarser lattice.
 _SEEN, _COARSER = 0.8, 4.0
 # Pixels that count at most where places are compared, of the lattice's 16 000.
