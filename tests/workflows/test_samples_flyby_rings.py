@@ -39,7 +39,7 @@ from workflows.samples.flyby_ring_rays import RingDisc, in_plane, lit_share, rin
 from workflows.samples.flyby_ring_render import cell_kernels, gather_ring_light
 from workflows.samples.flyby_ring_scene import plane_from_j2000, prepare_rings, sorted_edges
 from workflows.samples.flyby_ring_system import FEATURES, RING_BODIES, RINGED, RingScene, edge_radii, ring_catalogue
-from workflows.samples.flyby_ring_truth import RINGS, WHOLE, bound, ring_information
+from workflows.samples.flyby_ring_truth import RINGS, WHOLE, bound, ring_information, widest_bow
 from workflows.samples.flyby_system import Sighting, body_state, equator_from_pole, sun_state
 from workflows.samples.flyby_terrain import smooth_terrain
 from workflows.samples.flyby_time import et_from_utc
@@ -354,6 +354,19 @@ def test_straight_edges_leave_one_direction_unknown() -> None:
     assert (alone > 16.0).sum() == 1
     everything = bound(information, WHOLE, prior)[:2, :2]
     assert np.linalg.eigvalsh(everything)[1] == pytest.approx(values[1], rel=0.05)
+
+
+def test_bows_are_the_sagittas_of_circles() -> None:
+    for scale, radius in ((0.6, 55_630.0), (40.0, 57_600.0)):
+        shot = _shot(65.0, radius, 80.0, scale)
+        scene, disc = _quiet(shot)
+        useless = np.zeros(SMALL.shape_vu, dtype=bool)
+        _, alone, _ = ring_information(shot, scene, disc, useless)
+        seen = [int(k) for k in np.flatnonzero(alone > 16.0)]
+        # The longest chord is between the array's side and its diagonal.
+        sagittas = [n**2 / 8.0 / (radius / scale) for n in (160.0, 160.0 * np.sqrt(2.0))]
+        bow = widest_bow(shot, scene, disc, useless, seen)
+        assert 0.7 * sagittas[0] < bow < 1.4 * sagittas[1] + 0.1
 
 
 def _edge_points(shot: Shot, radius_km: float) -> Floats:

@@ -101,6 +101,13 @@ def edge_slopes(s, d, here, radius, slope, sigma_px, factor, index, value):  # t
 
 
 @numba.njit(cache=True)
+def _slope(radii, weight, i, j):  # type: ignore[no-untyped-def]
+    """Change of the radius along v, along u and in all, km per pixel; the last is zero where a pixel does not count."""
+    slope_v, slope_u, _ = radius_slopes(radii, i, j)
+    return slope_v, slope_u, np.sqrt(slope_v * slope_v + slope_u * slope_u) if weight > 0.0 else 0.0
+
+
+@numba.njit(cache=True)
 def gather_information(s, d, across, radii, columns, weight, owner, sigma_px, factor, middle, features):  # type: ignore[no-untyped-def]
     """Information (n, n) on the shared unknowns and on the features' radii, and (edges,) on each edge's own place.
 
@@ -115,9 +122,8 @@ def gather_information(s, d, across, radii, columns, weight, owner, sigma_px, fa
     for row in range(weight.shape[0]):
         for column in range(weight.shape[1]):
             i, j = row + BORDER_PX + 1, column + BORDER_PX + 1
-            slope_v, slope_u, _ = radius_slopes(radii, i, j)
-            slope = np.sqrt(slope_v * slope_v + slope_u * slope_u)
-            if weight[row, column] <= 0.0 or slope <= 0.0:
+            slope_v, slope_u, slope = _slope(radii, weight[row, column], i, j)
+            if slope <= 0.0:
                 continue
             found = edge_slopes(s, d, across[i, j], radii[i, j], slope, sigma_px, factor, index, value)
             if found == 0:
@@ -147,9 +153,8 @@ def edge_places(s, d, across, radii, weight, places):  # type: ignore[no-untyped
     for row in range(weight.shape[0]):
         for column in range(weight.shape[1]):
             i, j = row + BORDER_PX + 1, column + BORDER_PX + 1
-            slope_v, slope_u, _ = radius_slopes(radii, i, j)
-            slope = np.sqrt(slope_v * slope_v + slope_u * slope_u)
-            if weight[row, column] <= 0.0 or slope <= 0.0:
+            slope_v, slope_u, slope = _slope(radii, weight[row, column], i, j)
+            if slope <= 0.0:
                 continue
             here = across[i, j]
             way, a, b, _ = in_plane(d, here[0], here[1], 1.0)
