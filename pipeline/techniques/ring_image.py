@@ -91,7 +91,7 @@ def _enough_pixels(lattice: Lattice) -> int:
 
 
 def _lattice(frame: Frame, variance: Image) -> Lattice:
-    step = max(1, int(np.sqrt(frame.raw.size / _LATTICE)))
+    step = max(1, round(float(np.sqrt(frame.raw.size / _LATTICE))))
     good: BoolArray = ~frame.bad[::step, ::step]
     data = frame.raw[::step, ::step].astype(float)
     weight = np.where(good, 1.0 / variance[::step, ::step].astype(float), 0.0)
