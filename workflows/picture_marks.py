@@ -12,6 +12,8 @@ from workflows.picture_canvas import GREY, ORANGE, PURPLE, SKY, YELLOW, Canvas, 
 _LINES = ("limb", "terminator")
 # Neighbouring pieces of one line lie closer than this many medians of their distances.
 _GAP = 2.2
+# Pieces of ring edges are some 24 px long; a chord over more than a few of them is no edge.
+_RING_GAP_PX = 60.0
 _NAMES = 24
 _NAME_LETTERS = 16
 _NAME_SIZE = 11
@@ -153,12 +155,12 @@ def _found_centre(canvas: Canvas, place: FloatArray) -> None:
     canvas.circles(place, 4, ORANGE)
 
 
-def _runs(xy: FloatArray) -> list[FloatArray]:
-    """Split pieces into lines of neighbours."""
+def _runs(xy: FloatArray, widest: float = np.inf) -> list[FloatArray]:
+    """Split pieces into lines of neighbours, which are never farther apart than the widest gap."""
     if len(xy) < 2:
         return []
     gaps = np.hypot(*np.diff(xy, axis=0).T)
-    cuts = np.flatnonzero(gaps > _GAP * max(float(np.median(gaps)), 2.0)) + 1
+    cuts = np.flatnonzero(gaps > min(_GAP * max(float(np.median(gaps)), 2.0), widest)) + 1
     return [run for run in np.split(xy, cuts) if len(run) > 1]
 
 
@@ -203,7 +205,7 @@ def _rings(canvas: Canvas, document: Mapping[str, Json], shape: tuple[int, int])
     for name in dict.fromkeys(names):
         pieces = np.flatnonzero(placed & [each == name for each in names])
         pieces = pieces[np.argsort(longitude[pieces])]
-        for run in _runs(canvas.places(before[pieces])):
+        for run in _runs(canvas.places(before[pieces]), _RING_GAP_PX * canvas.scale):
             canvas.line(run, SKY)
         labelled.append((pieces, name.rpartition(" ")[0]))
     used, refused = placed & counted, placed & ~counted

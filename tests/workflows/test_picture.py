@@ -16,6 +16,7 @@ from workflows.cli import app
 from workflows.exits import EXIT_SOME_IN_ERROR
 from workflows.picture import draw_image
 from workflows.picture_canvas import Canvas
+from workflows.picture_marks import _runs
 from workflows.pictures import chosen, draw_all
 from workflows.samples.options import StarSampleOptions
 from workflows.samples.stars import make_star_sample
@@ -117,3 +118,11 @@ def test_a_name_near_the_border_is_written_inside_whole(x: float, y: float) -> N
     inner.text(x, y, "Ringlet 7", 12)
     outer.text(150.0, 150.0, "Ringlet 7", 12)
     assert inner.pixels.sum() == pytest.approx(outer.pixels.sum())
+
+
+def test_no_chord_is_drawn_over_a_wide_gap_of_an_edge() -> None:
+    # Sparse pieces: their median distance is as wide as the gaps.
+    places = np.array([[0.0, 0.0], [100.0, 0.0], [200.0, 0.0], [224.0, 0.0], [248.0, 0.0]])
+    (run,) = _runs(places, 60.0)
+    np.testing.assert_array_equal(run, places[2:])
+    assert len(_runs(places)) == 1
