@@ -16,8 +16,6 @@ from pipeline.geometry.patches import (
 )
 from pipeline.records import FloatArray
 
-RNG = np.random.default_rng(11)
-
 
 def at(x: float, y: float, z: float) -> FloatArray:
     return np.array([x, y, z])
@@ -49,7 +47,8 @@ def test_eq_3_24_longest_span_can_be_a_side() -> None:
 
 
 def test_eq_3_25_no_pierced_cell_is_thrown_away() -> None:
-    cells = RNG.normal(size=(4000, 4, 3)) + at(0, 0, 9)
+    rng = np.random.default_rng(11)
+    cells = rng.normal(size=(4000, 4, 3)) + at(0, 0, 9)
     inside = np.array([bool(patch_roots(cell)) for cell in cells])
     assert inside.sum() > 300
     assert near_cells(cells, longest_span(cells))[inside].all()
@@ -74,9 +73,10 @@ def test_eq_3_26_a_non_convex_cell_fails_the_cross_products_though_it_is_hit() -
 
 
 def test_eq_3_29_to_3_35_every_planted_point_is_found() -> None:
+    rng = np.random.default_rng(11)
     for _ in range(2000):
-        corners = RNG.normal(size=(4, 3)) + at(0, 0, 20)
-        iota, gamma = RNG.uniform(0.001, 0.999, 2)
+        corners = rng.normal(size=(4, 3)) + at(0, 0, 20)
+        iota, gamma = rng.uniform(0.001, 0.999, 2)
         target = point_of(corners, iota, gamma)
         roots = patch_roots(corners - at(target[0], target[1], 0.0))
         assert any(np.allclose(root, [iota, gamma, target[2]], atol=1e-6) for root in roots)

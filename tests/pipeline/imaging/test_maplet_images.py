@@ -21,8 +21,6 @@ from pipeline.imaging.maplet_images import (
 from pipeline.records import FloatArray
 from tests.pipeline.techniques.maplet_scene import maplet_on, relief, view_down
 
-RNG = np.random.default_rng(4)
-
 
 def flat(heights: FloatArray) -> Maplet:
     return Maplet("A", np.zeros(3), np.eye(3), 0.1, heights, np.ones(heights.shape), np.zeros((3, 3)))
@@ -64,21 +62,23 @@ def test_eq_3_38_to_3_40_angles_of_a_tilted_plane() -> None:
 
 
 def test_eq_3_42_to_3_45_scale_and_background_are_the_regression() -> None:
-    predicted = RNG.uniform(0.2, 1.0, 500)
+    rng = np.random.default_rng(4)
+    predicted = rng.uniform(0.2, 1.0, 500)
     extracted = 37.0 * predicted + 5.0
     assert brightness_scale(predicted, extracted, 1.0, 0.5) == pytest.approx((37.0, 5.0))
     scale, background = brightness_scale(predicted, extracted, 0.4, 0.5)
     assert (scale, background) == pytest.approx((extracted.mean() / predicted.mean(), 0.0))
-    noisy = extracted + RNG.normal(size=500)
+    noisy = extracted + rng.normal(size=500)
     slope, level = np.polyfit(predicted, noisy, 1)
     assert brightness_scale(predicted, noisy, 0.9, 0.5) == pytest.approx((slope, level))
 
 
 def test_eq_3_47_to_3_51_bilinear_and_the_bad_pixels_around() -> None:
-    image = RNG.uniform(0, 100, (20, 30)).astype(np.float32)
+    rng = np.random.default_rng(4)
+    image = rng.uniform(0, 100, (20, 30)).astype(np.float32)
     good = np.ones(image.shape, bool)
     good[10, 10] = False
-    places = RNG.uniform([-2, -2], [21, 31], (40, 40, 2))
+    places = rng.uniform([-2, -2], [21, 31], (40, 40, 2))
     places[0, 0] = [19.0, 29.0]
     places[0, 1] = np.nan
     values, valid = extract_image(image, good, places, 0.7)
@@ -96,14 +96,16 @@ def test_eq_3_47_to_3_51_bilinear_and_the_bad_pixels_around() -> None:
 
 
 def test_a_cell_of_several_pixels_is_their_mean() -> None:
-    image = RNG.uniform(0, 100, (200, 200)).astype(np.float32)
+    rng = np.random.default_rng(4)
+    image = rng.uniform(0, 100, (200, 200)).astype(np.float32)
     steps = 20.0 + 4.0 * np.arange(30)
     places = np.stack(np.meshgrid(steps, steps, indexing="ij"), axis=2)
     values, valid = extract_image(image, np.ones(image.shape, bool), places, 4.0)
     assert valid.all()
     exact = np.array([[image[v - 2 : v + 3, u - 2 : u + 3][1:-1, 1:-1].mean() for u in steps.astype(int)]
                       for v in steps.astype(int)])  # fmt: skip
-    assert np.corrcoef(values.ravel(), exact.ravel())[0, 1] > 0.85
+    # Over many seeds 0.857 with a scatter of 0.009; a single pixel and its neighbours' mean would have a third.
+    assert np.corrcoef(values.ravel(), exact.ravel())[0, 1] > 0.8
     assert values.std() < 0.35 * image.std()
 
 
